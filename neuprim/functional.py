@@ -29,9 +29,9 @@ class Rasterized:
 
     Attributes:
         rgb: (C, H, W, channels) colours, composited over the backgrounds.
-        alpha: (C, H, W) accumulated opacity 1 - T.
-        depth: (C, H, W) mean camera-z of the chord midpoints, with the weights of the colours, scene units; 0 where a
-            ray hits no primitive. None unless ``rasterize`` got ``depth=True``.
+        alpha: (C, H, W) accumulated opacity: 1 minus the transmittance behind all primitives.
+        depth: (C, H, W) mean depth (camera z, scene units), weighted like the colours; a primitive's depth is that of
+            the middle of the ray's segment inside it. 0 where a ray hits no primitive. None unless ``depth=True``.
         stats: statistics of each camera's image, see :class:`~neuprim.core.render.output.RenderStats`.
     """
 
@@ -41,9 +41,9 @@ class Rasterized:
     stats: tuple[RenderStats, ...]
 
     def request_contributions(self, error: Tensor) -> tuple[Contributions, ...]:
-        """Return, for each camera, how much every primitive contributes to the image and to an error.
+        """Return, for each camera, how much every primitive contributes to the image and to an error of the image.
 
-        Call this method before ``backward()``, which fills the result.
+        Call this method before ``backward()``. The result is 0 until ``backward()`` fills it.
 
         Args:
             error: (C, H, W) error of each pixel, in any measure; receives no gradient.
@@ -68,7 +68,8 @@ def rasterize(
 ) -> Rasterized:
     """Render N primitives from C pinhole cameras; differentiable.
 
-    A primitive is an ellipsoid with semi-axes ``s = exp(log_scales)``. Its density inside (1 / scene unit) is
+    A primitive is an ellipsoid with centre mu (``means``), rotation R (``quats``) and semi-axes
+    ``s = exp(log_scales)``. Its density at a point x inside (1 / scene unit) is
 
         sigma(x) = g (1 - |y|^2)^p f((x - mu) / m) / m,   m = max(s),   y = diag(1 / s) R^T (x - mu),
         g = exp(log_gain),   f(u) = sum_k w2_k cos(omega0 (W1_k . u + b1_k)) + b2
@@ -156,7 +157,11 @@ def _check_tensor(name: str, value: Any) -> None:
 def _check_primitives(
     t: Mapping[str, Tensor], views: int, omega0: float, edge: int
 ) -> tuple[Geometry, Cosine, list[Tensor]]:
-    """Check the tensors ``t``; return geometry, density and one colour tensor per camera. Does not look for NaN."""
+    """Check names, types and shapes of the tensors ``t``, the argument ``primitives`` of :func:`rasterize`.
+
+    Only ``log_gain`` is also checked for NaN and infinity. Return the ellipsoids, their density, and a tensor
+    (N, channels) of colours for each of ``views`` cameras.
+    """
     for name in t:
         if name not in (*_REQUIRED, "log_gain"):
             raise DataError(f"rasterize: unknown tensor {name!r}{nearest(name, [*_REQUIRED, 'log_gain'])}")
@@ -191,7 +196,10 @@ def _check_primitives(
 
 
 def _check_cameras(viewmats: Tensor, Ks: Tensor, size: tuple[int, int]) -> list[Camera]:
-    """Return one camera per matrix; intrinsics that require a gradient stay tensors."""
+    """Check the cameras of :func:`rasterize`; return one camera for each matrix of ``viewmats``.
+
+    The intrinsics of a camera are numbers, or tensors if they require a gradient.
+    """
     if len(size) != 2 or any(isinstance(side, bool) or not isinstance(side, int) or side < 1 for side in size):
         raise _wrong("size", f"value {size!r}", "two positive ints, width and height")
     _check_tensor("viewmats", viewmats)
@@ -225,7 +233,7 @@ def _check_cameras(viewmats: Tensor, Ks: Tensor, size: tuple[int, int]) -> list[
 
 
 def _check_backgrounds(backgrounds: Tensor | None, views: int, channels: int) -> Sequence[Tensor | None]:
-    """Return one background per camera."""
+    """Check the backgrounds of :func:`rasterize`; return one (channels,) tensor, or None for black, per camera."""
     if backgrounds is None:
         return [None] * views
     _check_tensor("backgrounds", backgrounds)

@@ -1,8 +1,8 @@
 """The ``neuprim`` command: parse arguments, call the library, print results.
 
-Exit status: 0 success, 1 no backend works (``doctor``), 2 wrong input (one line on standard error), 130 interrupted.
-A bug in neuprim shows its traceback. ``NEUPRIM_TRACEBACK=1`` shows the traceback of every error, for authors of
-plugins.
+Exit status: 0 for success; 1 for a bug, or if ``doctor`` finds no working renderer backend; 2 for wrong input, with one
+line on standard error; 130 after Ctrl-C; 141 if the reader of a pipe closes it. A bug in neuprim shows its traceback.
+The environment variable ``NEUPRIM_TRACEBACK=1`` shows the traceback of every error, for authors of plugins.
 """
 
 from __future__ import annotations
@@ -35,7 +35,10 @@ COMMANDS = {name: _FOUND[name] for name in _ORDER}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command that ``argv`` names and return its exit status."""
+    """Run one ``neuprim`` command and return its exit status.
+
+    ``argv`` has the words after ``neuprim``, e.g. ``["render", "RUN_DIR"]``; None takes them from ``sys.argv``.
+    """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         with warnings_as_lines():

@@ -35,7 +35,7 @@ how the run is drawn; `neuprim tradeoff RUN_DIR` measures cost and gain of each
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that reports a wrong command line as one line of text."""
+    """An argparse parser that raises ConfigError, with a one-line message, for a wrong command line."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, **options)
@@ -103,7 +103,7 @@ class Command:
 
 def add_trust_flag(parser: argparse.ArgumentParser) -> None:
     """Add the flag ``--trust``. It allows a stored configuration to name network addresses, and folders outside its run
-    directory (:mod:`neuprim.config.stored_run`).
+    directory to write to (:mod:`neuprim.config.stored_run`).
     """
     text = "allow what a stored config.yaml names: network addresses, and folders outside of the run to write to"
     parser.add_argument(FLAG, action="store_true", help=text)
@@ -121,7 +121,9 @@ def check_run_dir_argument(path: Path) -> None:
 
 
 def split_settings(words: Sequence[str], parser: argparse.ArgumentParser) -> tuple[list[str], list[str]]:
-    """Split words into settings ``KEY=VALUE`` and the rest: flags with their values, and an existing run directory.
+    """Split the words of a command line into (settings ``KEY=VALUE``, other words), two lists.
+
+    The other words are flags with their values, and the path of a run directory even if the path contains ``=``.
 
     Raises:
         ConfigError: a word is ``output_dir=DIR``; commands take the flag ``--out DIR`` instead.
@@ -145,9 +147,11 @@ def split_settings(words: Sequence[str], parser: argparse.ArgumentParser) -> tup
 def take_condition_arguments(
     arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser
 ) -> list[str]:
-    """Parse ``rest``, the words that argparse does not know, as conditions of the run's task; refuse other words.
+    """Parse ``rest``, the words that argparse does not know, as condition flags such as ``--time 0.5``.
 
-    Set ``arguments.conditions``, name -> text, and ``arguments.run``: the run directory, or the run if it was loaded.
+    A condition is an input of an image besides the camera; the run's task defines the conditions. Other words raise
+    ConfigError, so the returned list is empty. Set ``arguments.conditions``, name -> text, and ``arguments.run``: the
+    run directory, or the run if it was loaded.
     """
     arguments.conditions, arguments.run = {}, arguments.run_dir
     if not rest:
@@ -195,7 +199,10 @@ def print_columns(rows: Sequence[Sequence[str]]) -> None:
 
 
 def describe_interrupted_command(directory: Path, typed: CommandLine) -> str:
-    """Return text for the user that says what an interrupted run has saved, and the command that continues it."""
+    """Return text for the user: whether an interrupted run has a checkpoint, and the command that continues the run.
+
+    ``typed`` has the arguments of the interrupted command.
+    """
     begun = any((directory / file).exists() for file in ("checkpoint.safetensors", "chunks.json"))
     state = "contains a checkpoint of the run" if begun else "has no checkpoint yet"
     return f"; {directory} {state}; to continue:\n  {typed.resume_command(directory)}"
@@ -205,7 +212,7 @@ def describe_interrupted_command(directory: Path, typed: CommandLine) -> str:
 
 
 def parse_size_argument(text: str) -> tuple[int, int]:
-    """Parse 640x480 as (640, 480) pixels."""
+    """Parse an image size such as ``640x480``; return (width, height) in pixels."""
     match = re.fullmatch(r"([1-9]\d{0,5})[xX]([1-9]\d{0,5})", text)
     if not match:
         raise argparse.ArgumentTypeError(f"{text!r}: expected WIDTHxHEIGHT, for example 640x480")

@@ -41,7 +41,10 @@ _OTHER_PLUGINS: tuple[tuple[str, PluginGroup[Any]], ...] = (
 
 
 def list_printed_plugins() -> list[str]:
-    """Return the lines of ``neuprim tasks``: plugin names as users type them; for a broken plugin its error."""
+    """Return the text lines that ``neuprim tasks`` prints: name, package and summary of every installed plugin.
+
+    Names are written as users type them. A plugin that cannot be loaded is listed with the reason.
+    """
     lines: list[str] = []
     scenes = SCENES.survey()
     for task in TASKS.survey():
@@ -131,13 +134,13 @@ NEW_TASK_COMMAND = Command(
 
 
 _DEVELOPERS = ("test", "docs", "dev")
-"""Extras for work on neuprim itself."""
+"""Extras (optional groups of dependencies) for work on neuprim itself, which ``doctor`` does not list."""
 
 Rows = list[tuple[str, str]]
 
 
 def print_doctor_report() -> int:
-    """Print installed packages and working backends; return exit status 0, or 1 if no backend works."""
+    """Print the machine, installed packages, GPUs and working renderer backends; return 0, or 1 if no backend works."""
     from neuprim.core.compute.kernels import cache_directory as kernel_cache
     from neuprim.core.io.files import cache_directory
     from neuprim.core.render import backends

@@ -57,7 +57,10 @@ def _eval_command(arguments: argparse.Namespace) -> int:
 
 
 def _find_metric(metrics: Mapping[str, Any], name: str) -> float | None:
-    """Return a metric of ``metrics.json``, where null means infinity; None if the metric was not measured."""
+    """Return the metric ``name`` from the content of a run's ``metrics.json``; None if it was not measured.
+
+    JSON has no infinity: an infinite metric is stored as null, with a second entry ``NAME_infinite``.
+    """
     value: float | None = math.inf if metrics.get(f"{name}_infinite") else metrics.get(name)
     return value
 
@@ -111,7 +114,11 @@ def _add_bench_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _bench_command(args: argparse.Namespace) -> int:
-    """Print the paper's tables, or run their rows and print the comparison with the paper."""
+    """Run the command ``bench paper`` and return the exit status.
+
+    Without ``--data``, print the tables of the paper. With it, train the runs of the tables and print our values next
+    to the paper's.
+    """
     from neuprim.cli.progress import run_command_here
     from neuprim.config.command_settings import take_budget_override
     from neuprim.config.overrides import CommandLine
@@ -184,7 +191,10 @@ def _describe_bench_result(one: PlannedRun, metrics: Mapping[str, Any]) -> Itera
 
 
 def _describe_paper_averages(results: Sequence[tuple[PlannedRun, Mapping[str, Any]]]) -> Iterator[str]:
-    """Yield lines with each row's mean over the scenes and seeds for which both our and the paper's number exist."""
+    """Yield text lines that compare, for each row of the paper's tables, our mean of each metric with the paper's mean.
+
+    A mean covers the runs (scenes and seeds) for which both our value and the paper's value exist.
+    """
     from neuprim.runs.paper import compare_run_with_paper
 
     rows: dict[tuple[str, str], list[tuple[PlannedRun, Mapping[str, Any]]]] = {}
@@ -320,7 +330,10 @@ def _print_fronts(folder: Path, record: TradeoffRecord, commands: Sequence[str])
 
 
 def _list_front_rows(record: TradeoffRecord, numbers: Sequence[int]) -> list[Sequence[str]]:
-    """Return a table with the reference and the points ``numbers`` of a Pareto front, numbered like the commands."""
+    """Return rows of a table: titles, the reference (point 0), and the points of a Pareto front.
+
+    ``numbers`` are indices into ``record.points``. The first column counts the points of the front from 1.
+    """
     trained = bool(record.points[0].run_dir)
     names = ["#", "time", "ms", "frames/s", "PSNR", "SSIM", "bytes", *(["ms/step"] if trained else [])]
     first = ("centre" if trained else "ref.", *_format_printed_point(record.points[0]))

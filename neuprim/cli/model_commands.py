@@ -55,7 +55,10 @@ def _export_command(arguments: argparse.Namespace) -> int:
 
 
 def _export_help(words: Sequence[str]) -> str:
-    """Return the help text below the arguments: all export formats, or the options of ``--format NAME`` if typed."""
+    """Return the help text below the arguments: all export formats, or the options of ``--format NAME`` if typed.
+
+    The text is empty if ``words``, the command line, have no ``--help``.
+    """
     if not {"-h", "--help"} & set(words):
         return ""
     found = re.search(r"--format[= ]([^-\s]\S*)", " ".join(words))
@@ -91,7 +94,7 @@ def _format_option_default(value: Any) -> str:
 
 
 def print_export_report(report: ExportReport, as_json: bool) -> None:
-    """Print which files an export wrote, as text or as JSON."""
+    """Print the files that an export wrote, its errors against the model, and its notes, as text or as JSON."""
     if as_json:
         errors = {name: value if math.isfinite(value) else None for name, value in report.errors.items()}
         files, notes = [str(path) for path in report.files], list(report.notes)

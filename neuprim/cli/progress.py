@@ -131,11 +131,11 @@ class DrawProgress(_ProgressBar):
         self._started = time.monotonic()
 
     def print_note(self, text: str) -> None:
-        """Print a line that stays on the screen."""
+        """Print a line that remains on the screen after the progress bar is removed."""
         self.console.print(f"neuprim: {text}")
 
     def show(self, text: str, fraction: float) -> None:
-        """Show text and the done fraction, 0..1; without a terminal, print them every 30 seconds."""
+        """Show ``text`` and the completed ``fraction``, 0..1. Without a terminal, print both every 30 seconds."""
         self.bar.update(self.task, description=text, completed=fraction)
         if not self.live and fraction < 1.0 and time.monotonic() > self._started + 30.0:
             self._started = time.monotonic()
@@ -151,11 +151,14 @@ def print_notes(event: Event) -> None:
 # ---------------------------------------------------------------- several jobs
 
 _LINE_INTERVAL = 0.25
-"""Fraction of a training between two printed lines, if there is no terminal."""
+"""Progress of a training, as a fraction, between two printed lines; for output that is not a terminal."""
 
 
 class RunLaunchProgress:
-    """Progress display of several runs, called with (index of a run, status): a table on a terminal, else some text."""
+    """Progress display of several runs: a context manager, and a listener that is called with (index of a run, status).
+
+    A terminal shows a table. Other output gets a line when a run's state changes, and a few lines during training.
+    """
 
     def __init__(self, configs: Sequence[RunConfig]) -> None:
         self.console = plain_console(stderr=True)
@@ -174,7 +177,7 @@ class RunLaunchProgress:
         self._display.stop()
 
     def __call__(self, number: int, status: JobStatus) -> None:
-        """Show the status of run ``number``."""
+        """Show the new ``status`` of the run with index ``number``."""
         before, self._statuses[number] = self._statuses[number], status
         if not self.live:
             self._print_line(number, status)
@@ -196,7 +199,7 @@ class RunLaunchProgress:
         self.console.print(f"{self._directories[number].name}: {' '.join(filter(None, cells))}")
 
     def _print_change(self, number: int, before: JobStatus, status: JobStatus) -> None:
-        """Print that a run of several has started or ended, or that a run has failed."""
+        """Print a line when run ``number`` fails and, if there are several runs, when it starts or is done."""
         directory, many = self._directories[number], len(self._directories)
         if many > 1 and before.state == "waiting" and status.state == "starting" and not status.attempt:
             print(f"[{number + 1}/{many}] {directory}", flush=True)
@@ -244,7 +247,8 @@ def run_command_here(
     After Ctrl-C, the message of the KeyboardInterrupt has the run's directory and the command that continues the run.
 
     Args:
-        launcher: where to train the chunks, if the scene is trained in chunks; None: in this process.
+        viewer: settings of the live viewer in the browser; None for no viewer.
+        launcher: where to train the parts of a scene that ``scene.chunks`` divides; None: in this process.
     """
     from neuprim.runs.run import run
 

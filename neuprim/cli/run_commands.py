@@ -1,4 +1,8 @@
-"""``neuprim run`` and ``truth``: train one run, a sweep, or a search for a target; render ground truth for runs."""
+"""``neuprim run`` and ``neuprim truth``.
+
+``run`` trains one run, a sweep over values of settings, or a search for the smallest model that reaches a target, such
+as a PSNR. ``truth`` renders the ground-truth images of a scene before runs need them.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +62,7 @@ examples:
 
 
 def _run_help(words: Sequence[str]) -> str:
-    """Return the help text below the arguments, which lists the installed tasks."""
+    """Return the help text below the arguments: installed tasks and examples. "" if ``words`` have no ``--help``."""
     if not {"-h", "--help"} & set(words):
         return ""
     from neuprim.plugins.registry import TASKS, list_scene_names
@@ -81,7 +85,10 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _refuse_bare_words(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
-    """Refuse words other than KEY=VALUE and suggest what they mean. If ``rest`` has flags, return it unchanged."""
+    """Raise ConfigError for words without ``KEY=``, e.g. ``solids``; suggest the command that they mean.
+
+    ``rest`` has the words that argparse does not know. If it is empty or has flags, return it unchanged.
+    """
     if not rest or any(word.startswith("-") for word in rest):
         return rest
     from neuprim.plugins.registry import TASKS, list_scene_names
@@ -152,7 +159,7 @@ def _run_command(args: argparse.Namespace) -> int:
 def _run_command_with_target(
     config: RunConfig, target: SearchTarget, budget: float, launcher: LauncherSettings, typed: CommandLine
 ) -> int:
-    """Search for a model that reaches a target, print the result, and return the exit status."""
+    """Search for a model that reaches ``target``, for ``budget`` seconds; print the result; return the exit status."""
     from neuprim.cli.progress import RunProgress, print_run_summary
     from neuprim.search.target import run_target
 
@@ -171,7 +178,7 @@ def _run_command_with_target(
 
 
 def _list_printed_target_lines(record: TargetRecord) -> list[str]:
-    """Return the lines that report a search: predicted and achieved values, and why the search ended."""
+    """Return the text lines that report a finished search: predicted and achieved values, and why the search ended."""
     from neuprim.search.size_forecast import format_target_forecast
     from neuprim.search.target_record import TARGET_FILE
 
@@ -202,10 +209,12 @@ RUN_COMMAND = Command(
 def run_command_with_launcher(
     configs: Sequence[RunConfig], overrides: list[str], settings: LauncherSettings, typed: CommandLine
 ) -> int:
-    """Launch the runs of a sweep, or a single run in another process; return the exit status.
+    """Train the runs of a sweep, or a single run, with a launcher; return the exit status.
 
     Args:
-        overrides: overrides of the sweep.
+        configs: configuration of each run.
+        overrides: ``KEY=VALUE`` arguments of the sweep, without settings of the launcher.
+        settings: the launcher (this process, local processes, Ray or Slurm) and its settings.
         typed: the whole command line, from which the command that continues after Ctrl-C is made.
     """
     from neuprim.cli.progress import RunLaunchProgress, print_run_summary
@@ -230,9 +239,14 @@ def run_command_with_launcher(
 def _report_launched_runs(
     configs: Sequence[RunConfig], results: Sequence[JobResult | None], live: bool, typed: CommandLine
 ) -> int:
-    """Print failed runs; return the exit status: 1 for a bug, else 2 for bad input, else 0. After Ctrl-C, raise
-    KeyboardInterrupt with the command that continues. If ``live``, a table showed the progress; only
-    then does this function print the errors of failed runs and, in a sweep, the directories of finished ones."""
+    """Report the results of launched runs; return the exit status: 1 if a run had a bug, 2 for bad input, else 0.
+
+    If ``live``, a table on the terminal showed the progress. Then this function prints the errors of failed runs and,
+    in a sweep, the directories of finished runs. Otherwise these lines were printed during the runs.
+
+    Raises:
+        KeyboardInterrupt: runs were interrupted. The message has the command that continues them.
+    """
     status, left = 0, []
     for config, result in zip(configs, results, strict=True):
         if result is None or result.state == "interrupted":
@@ -309,12 +323,13 @@ TRUTH_COMMAND = Command(
 
 
 def run_command_as_rank(place: TorchrunRank, words: list[str], more: bool) -> int:
-    """Train one run as one of several ranks; return the exit status.
+    """Train one run in a process that torchrun started, and return the exit status.
 
-    Only the first rank that fails prints its error, in one line.
+    Several such processes (ranks) train one model together. Only the first rank that fails prints its error, one line.
 
     Args:
-        words: the overrides.
+        place: rank of this process, and number of ranks.
+        words: ``KEY=VALUE`` arguments of the run.
         more: whether the user typed ``-m``, ``--config`` or ``--print-config``, which are refused.
     """
     from neuprim.core.compute.threads import limit_process_threads, machine_cores
@@ -357,7 +372,10 @@ def run_command_as_rank(place: TorchrunRank, words: list[str], more: bool) -> in
 
 
 def _compose_rank_arguments(words: list[str], more: bool, group: ProcessGroup) -> RunConfig:
-    """Compose a rank's configuration. All ranks use the output directory that rank 0 chooses and writes to."""
+    """Return the configuration of a rank (one of torchrun's processes), and select the GPU of the rank.
+
+    All ranks use the output directory that rank 0 chooses and writes to. Arguments: see :func:`run_command_as_rank`.
+    """
     from neuprim.config import compose
     from neuprim.config.command_settings import take_launcher_overrides, take_target_overrides, take_viewer_overrides
 
@@ -380,10 +398,12 @@ def _compose_rank_arguments(words: list[str], more: bool, group: ProcessGroup) -
 
 
 def _select_rank_gpu(config: RunConfig, place: TorchrunRank) -> None:
-    """Make the i-th rank of a machine use the machine's GPU i.
+    """Make this process use GPU i if it is the i-th of torchrun's processes (ranks) on its machine.
+
+    Does nothing on a machine without GPUs, or if the configuration asks for the CPU.
 
     Raises:
-        BackendUnavailable: the machine has GPUs, but fewer than ranks.
+        BackendUnavailable: the machine has GPUs, but fewer GPUs than ranks.
     """
     import torch
 
@@ -401,7 +421,7 @@ def _select_rank_gpu(config: RunConfig, place: TorchrunRank) -> None:
 
 
 def _fit_with_rank_progress(config: RunConfig, overrides: Sequence[str], group: ProcessGroup) -> None:
-    """Train the run as one rank; rank 0 shows the progress."""
+    """Train the run as one rank of ``group``. Only rank 0 shows the progress, and a summary at the end."""
     from neuprim.cli.progress import RunProgress, print_run_summary
     from neuprim.config.overrides import CommandLine
     from neuprim.runs.fit import ignore_run_event

@@ -220,7 +220,7 @@ def _add_view_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _view_command(args: argparse.Namespace) -> int:
-    """Show the run in the browser until Ctrl-C."""
+    """Show the run in the browser until Ctrl-C; return the exit status."""
     from neuprim.cli.progress import DrawProgress, warn_of_open_host
     from neuprim.config.command_settings import LOOPBACK, ViewerSettings
     from neuprim.viewer.view import view_run
@@ -265,7 +265,7 @@ def _add_vdb_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _vdb_info_command(arguments: argparse.Namespace) -> int:
-    """Print a report on a file, or one table of the grids in a folder."""
+    """Print the grids of OpenVDB files: one report per file, or one table for a folder with a sequence of frames."""
     files, notes, one_sequence = _find_vdb_command_files(arguments.path)
     if arguments.json:
         record = {"files": [_describe_vdb_command_file(file) for file in files], "notes": notes}
@@ -283,8 +283,8 @@ def _vdb_info_command(arguments: argparse.Namespace) -> int:
 
 
 def _find_vdb_command_files(path: Path) -> tuple[list[Path], list[str], bool]:
-    """Return the OpenVDB files at ``path`` in the order of their frames, texts that describe the folder, and whether
-    the files are one sequence.
+    """Return the OpenVDB files at ``path`` (a file or folder) in the order of frames, texts that describe the folder,
+    and whether the files are one sequence.
     """
     if not path.is_dir():
         return [path], [], False
@@ -321,8 +321,10 @@ def _describe_vdb_command_file(path: Path) -> dict[str, Any]:
 
 
 def _describe_grid(header: GridHeader, grid: VdbGrid | None) -> dict[str, Any]:
-    """Return a description of one OpenVDB grid as JSON-ready values. If the grid cannot be decoded, ``reason`` says
-    why, and values computed from voxels are missing.
+    """Return a description of one OpenVDB grid as JSON-ready values.
+
+    ``grid`` is None if the voxels cannot be decoded. Then the entry ``reason`` says why, and all values that are
+    computed from voxels are missing.
     """
     entry: dict[str, Any] = {
         "name": header.name,
@@ -354,7 +356,7 @@ def _describe_grid(header: GridHeader, grid: VdbGrid | None) -> dict[str, Any]:
 
 
 def _vdb_command_to_json(value: Any) -> Any:
-    """Convert a value to JSON types: replace bytes, tuples and NaN."""
+    """Convert OpenVDB metadata to JSON types. Bytes become text with their number; NaN and infinity become text."""
     if isinstance(value, Mapping):
         return {name: _vdb_command_to_json(item) for name, item in value.items()}
     if isinstance(value, tuple | list):

@@ -48,7 +48,7 @@ class LauncherSettings:
         validate_fields(self, "launcher")
 
     def given_settings(self) -> dict[str, Any]:
-        """Return the name of the launcher, and the settings that differ from the defaults."""
+        """Return setting -> value: the name of the launcher, and the settings that differ from the defaults."""
         values, default = dataclasses.asdict(self), dataclasses.asdict(LauncherSettings())
         return {name: value for name, value in values.items() if name == "name" or value != default[name]}
 
@@ -130,7 +130,7 @@ def take_viewer_overrides(overrides: Sequence[str]) -> tuple[ViewerSettings | No
 
 
 def take_target_overrides(overrides: Sequence[str]) -> tuple[tuple[SearchTarget, float] | None, list[str]]:
-    """Split overrides into (target, budget in seconds) and the other overrides. Without both, the pair is None."""
+    """Split overrides into (target, budget in seconds) and other overrides; the pair is None if neither is given."""
     budget, rest = take_budget_override(overrides)
     whole, target, others = take_settings(rest, "target", SearchTarget)
     if len(others) == len(overrides):
@@ -154,7 +154,7 @@ def take_budget_override(overrides: Sequence[str]) -> tuple[str | None, list[str
 
 @dataclass(frozen=True)
 class _Budget:
-    """Empty settings group of ``budget=10m``."""
+    """Settings group without settings: ``budget=10m`` has a value, and no ``budget.KEY`` is valid."""
 
 
 def parse_duration_setting(text: str, asked: str) -> float:

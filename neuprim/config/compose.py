@@ -93,7 +93,7 @@ _REQUIRED = "???"
 
 @dataclass(frozen=True)
 class _Selection:
-    """Loaded task, scene, preset and level of effort of a configuration, and default name of the run directory."""
+    """Loaded task, scene, preset and level of effort of a configuration, and default ``name`` of the run directory."""
 
     task_info: PluginInfo
     spec: TaskSpec
@@ -158,7 +158,10 @@ def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConf
 def compose_all(
     overrides: Sequence[str], check_output: bool = True, stored: RunConfig | None = None
 ) -> list[RunConfig]:
-    """Return the configurations of all runs of a sweep, each with its own folder. Arguments: see :func:`compose`."""
+    """Return the configurations of all runs of a sweep, each with its own directory in the sweep's directory.
+
+    A sweep has one run for each combination of values, e.g. for ``seed=0,1``. Arguments: see :func:`compose`.
+    """
     swept = set(swept_override_keys(overrides))
     if not swept:
         return [compose(overrides, check_output, stored)]
@@ -190,8 +193,10 @@ def compose_all(
 
 
 def _uses_own_stored_config(directory: Path, own: Sequence[str], recorded: bool) -> bool:
-    """Return whether a run of a sweep resumes with the configuration in its directory. If the sweep has a record, the
-    stored overrides must equal ``own``. Other overrides are refused later, by comparison with the record.
+    """Return whether a run of a resumed sweep starts from the ``config.yaml`` in its directory.
+
+    If the sweep has a record (``recorded``), the stored overrides must equal ``own``, the overrides of the run now,
+    without output directory and ``resume``. Different overrides are refused later, by comparison with the record.
     """
     if not (directory / "config.yaml").is_file():
         return False
@@ -212,7 +217,7 @@ def preset_settings(spec: TaskSpec, preset: str, scene: str, level: Level | None
 
 
 def _read_choice(assignments: Sequence[Assignment], key: str) -> str | None:
-    """Return the value typed for the choice ``key``, e.g. ``task`` or ``preset``; None if there is none."""
+    """Return the last value typed for ``key`` (task, scene, preset or effort) as text; None if there is none."""
     given = [a for a in assignments if a.key == key]
     if not given or given[-1].value is None:
         return None
@@ -224,7 +229,7 @@ def _read_choice(assignments: Sequence[Assignment], key: str) -> str | None:
 
 
 def _select_task_scene_and_preset(choices: Mapping[str, str | None]) -> _Selection:
-    """Load the chosen task, and find its chosen scene, preset and level of effort."""
+    """Load the chosen task, and find its scene, preset and level of effort; choices that are None take the defaults."""
     task_name = choices["task"] or DEFAULT_TASK
     info, spec = TASKS.load_with_info(task_name)
     check_config_groups(spec)
@@ -249,8 +254,13 @@ def _compose_run_config(
 ) -> tuple[RunConfig, list[str]]:
     """Return a validated configuration, and the names of the scene settings that are paths.
 
-    Settings of ``earlier`` runs replace the defaults; with ``new_launch``, all except ``train.views_per_step``. The
-    field ``overrides`` of the configuration is not set yet.
+    The field ``overrides`` of the configuration is not set yet.
+
+    Args:
+        values: overrides, except those that choose task, scene, preset and effort.
+        earlier: stored runs, whose settings replace the defaults.
+        new_launch: whether torchrun resumes the run with the arguments of a new run. Then the stored value of
+            ``train.views_per_step`` is not used.
     """
     spec, scene = chosen.spec, chosen.scene
     base = _read_base(spec, scene.spec.name, scene.config_package, chosen.preset, chosen.options)
@@ -313,7 +323,7 @@ def _merge_overrides(earlier: RunConfig, overrides: Sequence[str]) -> list[str]:
 
 
 def _read_base(spec: TaskSpec, scene: str, package: str, preset: str, options: dict[str, Any]) -> _BaseConfig:
-    """Merge defaults, preset and scene settings; ``package`` has the YAML file of the scene."""
+    """Return the merged settings of defaults, preset and scene. ``package`` has the scene's YAML file."""
     from omegaconf import OmegaConf
 
     scene_node, preset_node = (
@@ -422,7 +432,11 @@ def _validate_scene(node: Mapping[str, Any], declared: Mapping[str, Any], paths:
 
 
 def _flatten_config_settings(tree: Mapping[str, Any], settings: RunSettings) -> dict[str, Any]:
-    """Return dotted key -> value of all settings. The settings classes convert values, e.g. a rate of 1 to 1.0."""
+    """Return dotted key -> value of all settings, except ``output_dir`` and ``resume``.
+
+    Scene settings and task options come from the nested ``tree``. All others come from ``settings``, whose classes
+    have converted the values, e.g. a rate of 1 to 1.0.
+    """
     values = {**dataclasses.asdict(settings), "scene": tree["scene"], "task": tree["task"]}
     return flatten({key: value for key, value in values.items() if key not in ("output_dir", "resume")})
 

@@ -52,7 +52,10 @@ class CommandLine:
 
 
 def parse_overrides(overrides: Sequence[str]) -> list[Assignment]:
-    """Parse overrides of one value each. A leading ``+`` or ``++`` is ignored, because keys are checked by name."""
+    """Parse overrides ``key=value``; raise ConfigError for one that is invalid or has several values.
+
+    A leading ``+`` or ``++`` has no effect, because keys are checked by name.
+    """
     found = []
     for override, text in zip(_parse_with_hydra(overrides), overrides, strict=True):
         if override.is_sweep_override():
@@ -88,7 +91,7 @@ def take_settings(overrides: Sequence[str], group: str, cls: type[T]) -> tuple[A
 
 
 def expand_sweep_overrides(overrides: Sequence[str]) -> list[list[str]]:
-    """Return the overrides of every run of a sweep: all combinations of the values of keys with several values.
+    """Return one list of overrides for every run of a sweep. The runs are all combinations of the swept values.
 
     Several values are written with commas, ``range(...)`` or ``choice(...)``.
 
@@ -120,7 +123,10 @@ def expand_sweep_overrides(overrides: Sequence[str]) -> list[list[str]]:
 
 
 def sweep_override_names(overrides: Sequence[str], combinations: Sequence[Sequence[str]]) -> list[str]:
-    """Return a unique directory name for each run of a sweep, made of the swept keys and their values."""
+    """Return a unique directory name for each run of a sweep, from swept keys and values, e.g. ``seed-1``.
+
+    ``combinations`` is the result of :func:`expand_sweep_overrides`.
+    """
     swept = [i for i, override in enumerate(_parse_with_hydra(overrides)) if override.is_sweep_override()]
     names: list[str] = []
     for combination in combinations:
@@ -132,7 +138,7 @@ def sweep_override_names(overrides: Sequence[str], combinations: Sequence[Sequen
 
 
 def quote_override(key: str, value: Any) -> str:
-    """Return ``key=value`` so that :func:`parse_overrides` restores the value. Text is quoted where necessary."""
+    """Return the override ``key=value``, quoted if necessary, from which :func:`parse_overrides` restores ``value``."""
     if value is None:
         return f"{key}=null"
     if not isinstance(value, str):

@@ -112,7 +112,7 @@ class RunConfig:
         return tree
 
     def override(self, values: Mapping[str, Any]) -> RunConfig:
-        """Return a copy with new values for settings, given by dotted key; ``non_default`` is updated."""
+        """Return a copy in which ``values``, dotted key -> value, replace settings; :attr:`non_default` is updated."""
         tree = self.to_dict()
         for key, value in values.items():
             *path, name = key.split(".")
@@ -151,7 +151,7 @@ class RunConfig:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> RunConfig:
-        """Return the configuration with the values that :meth:`to_dict` returned.
+        """Make a configuration from the values that :meth:`to_dict` returned.
 
         Raises:
             ConfigError: a setting in ``data`` does not exist or has an invalid value.
@@ -234,7 +234,7 @@ def _read_config_yaml(file: Path) -> Mapping[str, Any]:
 
 
 def flatten(node: Mapping[str, Any], where: str = "") -> dict[str, Any]:
-    """Return dotted key -> value of nested settings; ``where`` is the key of ``node``."""
+    """Return dotted key -> value of nested settings; ``where`` is the dotted key of ``node`` itself, "" at the top."""
     found: dict[str, Any] = {}
     for key, value in node.items():
         name = join_setting_key(where, str(key))
@@ -254,20 +254,22 @@ class Job:
 
     @classmethod
     def of(cls, config: RunConfig) -> Job:
-        """Load a configuration's task, with the conditions of its scene. Raises the errors of
-        :func:`load_config_task`."""
+        """Return the job of a configuration: load its task, and keep the conditions that the run's scene has.
+
+        Conditions are inputs of an image besides the camera, e.g. time. Raises the errors of :func:`load_config_task`.
+        """
         task = load_config_task(config, config.source)
         conditions = tuple(spec for spec in task.conditions if spec.of_scene(config.scene))
         return cls(config, task if conditions == task.conditions else replace(task, conditions=conditions))
 
     @property
     def scene(self) -> FoundScene:
-        """The run's scene, from the task's package or another."""
+        """The run's scene, and the package that provides it: the package of the task or another."""
         return find_config_scene(self.config, self.task, self.config.source)
 
     @property
     def plugins(self) -> RunPlugins:
-        """The plugins of the run, to name them in errors of their code."""
+        """Names and packages of the run's plugins (task, scene, loss), for messages about errors in their code."""
         return find_config_plugins(self.config)
 
 
@@ -282,7 +284,7 @@ def load_config_task(config: RunConfig, file: Path | None = None) -> TaskSpec:
 
 
 def find_config_scene(config: RunConfig, task: TaskSpec, file: Path | None = None) -> FoundScene:
-    """Find a run's scene: one of the task's own, or one of the package that made the run.
+    """Find a run's scene, among the task's own scenes or the scenes that other packages add to the task.
 
     Raises the errors of :func:`load_config_task`.
     """
@@ -294,14 +296,14 @@ def find_config_scene(config: RunConfig, task: TaskSpec, file: Path | None = Non
 
 
 def current_config_provenance(config: RunConfig, task: TaskSpec) -> Provenance:
-    """Return the provenance of a run that starts or resumes now: its packages, in the installed versions."""
+    """Return the record of the packages that provide a run's task, scene and loss, with the versions installed now."""
     task_info = TASKS.find(config.made_by.task.qualified_name)
     loss = None if config.train.loss is None else LOSSES.find(config.train.loss)
     return Provenance.of_installed(task_info, find_config_scene(config, task), loss)
 
 
 def find_config_plugins(config: RunConfig) -> RunPlugins:
-    """Find the plugins of a run, so that errors in their code can name them."""
+    """Return names and packages of a run's task, scene and loss, for messages about errors in their code."""
     made = config.made_by
     scene = config.scene_name if made.scene is None else made.scene.qualified_name
     return RunPlugins(made.task.qualified_name, scene, config.train.loss)

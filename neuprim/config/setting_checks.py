@@ -30,9 +30,10 @@ CHOICES = ("task", "scene", "preset", "effort")
 
 
 def check_config_key(assignment: Assignment, scene: Mapping[str, Any], scene_name: str) -> None:
-    """Raise ConfigError for a key that names no setting; the error suggests the nearest settings.
+    """Raise ConfigError if the key of an override names no setting; the error suggests settings with similar names.
 
     Args:
+        assignment: the override ``key=value``.
         scene: the scene's settings; ``scene.NAME`` is a valid key for each name.
     """
     key = assignment.key
@@ -64,7 +65,10 @@ def _setting_names(cls: type, where: str = "") -> Iterator[str]:
 
 
 def _is_setting(path: list[str]) -> bool:
-    """Return whether field names, beginning in :class:`RunSettings`, end at a setting or in a dictionary of options."""
+    """Return whether ``path``, a dotted key split at the dots, names something in :class:`RunSettings`.
+
+    Valid are a setting, a group of settings, and any entry of a setting that is a dictionary.
+    """
     hint: Any = RunSettings
     for part in path:
         if get_origin(hint) is dict or hint is Any:
@@ -93,7 +97,11 @@ def task_and_loss_options(spec: TaskSpec, loss: LossExtension | None) -> Mapping
 def complete_task_options(
     declared: Mapping[str, Option], given: Any, owner: str, where: str = "task.options"
 ) -> dict[str, Any]:
-    """Return option -> given or default value, for every declared option. Errors name ``owner`` and ``where``."""
+    """Return option -> value for every declared option: the value in ``given``, or else the default.
+
+    Raise ConfigError for an undeclared option or an invalid value. The message names ``owner``, who declares the
+    options, e.g. "task 'static'", and ``where``, the dotted key of the options.
+    """
     if not isinstance(given, Mapping):
         raise ConfigError(f"{where}={format_setting_value(given)}: expected entries, each as {where}.KEY=VALUE")
     for key in given:
@@ -111,13 +119,16 @@ def complete_task_options(
 
 
 def unused_settings(spec: TaskSpec, loss: LossExtension | None) -> tuple[str, ...]:
-    """Return the names of optional shared settings that neither the run's task nor its loss reads."""
+    """Return the dotted names of the optional shared settings that neither the run's task nor its loss reads.
+
+    Optional shared settings are, for example, ``model.neurons``. A task or loss lists in ``uses`` those that it reads.
+    """
     train = spec.uses if loss is None else loss.uses
     return tuple(name for name in OPTIONAL if name not in (spec.uses if name.startswith("model.") else train))
 
 
 def refuse_unused(names: Iterable[str], spec: TaskSpec, loss: LossExtension | None) -> None:
-    """Raise ConfigError if neither task nor loss reads a shared setting in ``names``; suggest settings they read."""
+    """Raise ConfigError if ``names`` has a shared setting that neither task nor loss reads; suggest what they read."""
     unused = unused_settings(spec, loss)
     for name in names:
         if name in unused:
@@ -129,9 +140,11 @@ def refuse_unused(names: Iterable[str], spec: TaskSpec, loss: LossExtension | No
 
 
 def check_config_parameter_names(spec: TaskSpec, settings: RunSettings) -> None:
-    """Raise ConfigError for names under ``model.init``, ``train.rates`` and ``train.rate_units`` that no field of the
-    task has. Does nothing if the task does not list its fields. Names that only the chosen fields lack are refused
-    later."""
+    """Raise ConfigError for unknown parameter names under ``model.init``, ``train.rates`` and ``train.rate_units``.
+
+    A name is unknown if none of the task's fields (density and colour functions) has it. Does nothing if the task does
+    not list its fields. Names that other fields of the task have, but not the chosen ones, are refused later.
+    """
     if not spec.fields:
         return
     init = {"scale", "points", "surroundings", *(name for cls in spec.fields.values() for name in cls.init_settings)}

@@ -26,13 +26,13 @@ from neuprim.plugins.registry import BUILT_IN, TASKS, split_plugin_name
 ROOT = Path("outputs")
 DEFAULT_TASK = "static"
 Choices = Mapping[str, str | None]
-"""Key (task, scene, preset, effort) -> what the user typed; None if nothing."""
+"""Mapping from each of the keys task, scene, preset and effort to the value that the user typed, None if not typed."""
 
 _FREE = ("memory", "chunks")
-"""Scene settings that a resumed run may change: memory for decoding, and the chunks, which have a record."""
+"""Scene settings that a resumed run may change: memory for decoding, and chunks, which ``chunks.json`` records."""
 
 _SEARCH, _SWEEP = "target.json", "sweep.json"
-"""Records in directories of a search and a sweep, which resume with their own overrides."""
+"""Names of the record files of a search for a target and of a sweep, which resume with their own overrides."""
 
 
 def read_stored_config(path: Path) -> RunConfig:
@@ -43,9 +43,10 @@ def read_stored_config(path: Path) -> RunConfig:
 
 
 def stored_choices(stored: RunConfig, typed: Choices, resumed: bool = False) -> dict[str, str | None]:
-    """Return task, scene, preset and level of effort: the typed choice, else that of the stored run.
+    """Return task, scene, preset and level of effort: what the user typed, or else what the stored run has.
 
-    With ``--config`` the user may type another scene. With ``resume=true`` (``resumed``) the user may type a level.
+    With ``--config`` the user may type another scene. With ``resume=true`` (``resumed`` is True) the user may type a
+    level of effort.
 
     Raises:
         ConfigError: a typed choice contradicts the stored run.
@@ -66,10 +67,11 @@ def stored_choices(stored: RunConfig, typed: Choices, resumed: bool = False) -> 
 
 
 def stored_settings(stored: RunConfig, same_scene: bool) -> dict[str, Any]:
-    """Return key -> value of a stored run's settings, with ``$`` replaced so that OmegaConf resolves no ``${...}``.
+    """Return key -> value of a stored run's settings, to be merged with OmegaConf.
 
-    A value replaces the whole value of its key; dictionaries are not merged. Only overrides and packages may use
-    references ``${...}``; a stored file may not. :func:`restore_config_references` restores ``$``.
+    A value replaces the whole value of its key; dictionaries are not merged. A stored file may not use references
+    ``${...}``; only overrides and packages may. So that OmegaConf resolves none, a character 0 is inserted after every
+    ``$``. :func:`restore_config_references` removes it. With ``same_scene``, the settings of the scene are included.
     """
     tree = stored.to_dict()
     found = {key: tree[key] for key in ("model", "train", "renderer", "metrics", "seed")}
@@ -80,7 +82,10 @@ def stored_settings(stored: RunConfig, same_scene: bool) -> dict[str, Any]:
 
 
 def restore_config_references(value: Any) -> Any:
-    """Remove the character 0 that :func:`stored_settings` inserts after every ``$``. YAML text cannot contain it."""
+    """Return ``value`` without the character 0 that :func:`stored_settings` inserts after every ``$`` of its texts.
+
+    YAML text cannot contain the character 0, so no other text is changed.
+    """
     return _replace_config_text(value, "$\0", "$")
 
 
@@ -154,7 +159,12 @@ def find_resumed_config(typed: Mapping[str, Any], choices: Choices, has_file: bo
 def refuse_contradictions(begun: RunConfig, now: RunConfig, paths: Iterable[str]) -> None:
     """Raise ConfigError if a resumed run changes its model, scene, task options, seed or loss.
 
-    Budgets, rates, renderer and memory settings may change, and so may ``paths``, the scene settings for data files.
+    Budgets, learning rates, renderer and memory settings may change, and so may the scene settings with paths.
+
+    Args:
+        begun: stored configuration of the run.
+        now: configuration with which the run resumes.
+        paths: names of the scene settings that hold paths of data files.
     """
     free = {f"scene.{name}" for name in (*paths, *_FREE)}
     before, after = _fixed_config_settings(begun), _fixed_config_settings(now)

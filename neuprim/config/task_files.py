@@ -47,7 +47,7 @@ class TaskChoices:
 
 @dataclass(frozen=True)
 class Level:
-    """A level of effort: the preset that it changes, and its settings as overrides."""
+    """A level of effort, 1 (fast) to 9 (good): the name of a preset, and settings that replace those of the preset."""
 
     preset: str
     settings: tuple[Assignment, ...]
@@ -108,9 +108,13 @@ def find_config_package(spec: TaskSpec) -> Traversable:
 
 
 def read_config_group(spec: TaskSpec, group: str, name: str, package: str | None = None) -> dict[str, Any]:
-    """Return the settings of a scene or preset, merged over its ``defaults``; ``${...}`` is not resolved.
+    """Return the settings in a scene's or preset's YAML file, merged over the files that its entry ``defaults`` lists.
+
+    References ``${...}`` are not resolved.
 
     Args:
+        group: "scene" or "preset".
+        name: name of the scene or preset.
         package: package that holds the YAML file; None for the task's own.
     """
     root = find_config_package(spec) if package is None else _open_config_package(package, f"scene {name!r}")
@@ -178,8 +182,10 @@ def _open_config_package(name: str, who: str) -> Traversable:
 def choose_config_effort_level(
     spec: TaskSpec, chosen: str | None, preset: str | None, presets: Sequence[str]
 ) -> Level | None:
-    """Return the level of effort that the user chose; None if ``chosen`` is None. Raise ConfigError if the user typed a
-    ``preset`` other than the level's.
+    """Return the level of effort that the user chose; None if ``chosen`` is None.
+
+    ``chosen`` is the text after ``effort=``, 1 (fast) to 9 (good). ``presets`` are the task's presets. Raise
+    ConfigError if there is no such level, or the user typed a ``preset`` other than the level's.
     """
     if chosen is None:
         return None
@@ -198,7 +204,7 @@ def choose_config_effort_level(
 
 
 def read_config_effort_levels(spec: TaskSpec, presets: Sequence[str]) -> Mapping[int, Level] | None:
-    """Return number -> level of effort of a task; None if the task has no levels."""
+    """Return number (1 to 9) -> level of effort; None if the task has no levels. ``presets``: names of its presets."""
     place = f"effort/{spec.name}.yaml"
     file = find_config_package(spec) / place
     if not file.is_file():

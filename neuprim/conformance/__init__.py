@@ -85,7 +85,11 @@ _STEPS = 4
 
 
 def check_description_conformance(t: TaskUnderTest) -> None:
-    """Check that the TaskSpec is valid, scenes, presets, efforts and tunable settings work, and typos are refused."""
+    """Check that a task's description is valid and consistent with its configuration files.
+
+    The TaskSpec must be valid. The task must accept its scenes, presets, effort levels and tunable settings, and refuse
+    an unknown setting.
+    """
     problem = validate_spec(t.task)
     t.require(problem is None, "TaskSpec", problem, "members as documented in neuprim.core.task.TaskSpec")
     t.require(bool(t.task.fields), "TaskSpec.fields", t.task.fields, "every field class by its name")
@@ -136,7 +140,10 @@ def _check_settings(t: TaskUnderTest, model: dict[str, Any], options: dict[str, 
 
 
 def check_fields_conformance(t: TaskUnderTest) -> None:
-    """Check that a field rebuilt from its JSON settings has the same parameters, and unknown settings are refused."""
+    """Check that the settings of the density and colour field, as JSON, are enough to rebuild the field.
+
+    The rebuilt field must have the same parameters. The class must refuse an unknown setting.
+    """
     for kind, field in zip(("density", "colour"), t.build_fields(), strict=True):
         name, settings = type(field).__name__, field.settings()
         listed = (t.task.fields or {}).get(name)
@@ -153,7 +160,7 @@ def check_fields_conformance(t: TaskUnderTest) -> None:
 
 
 def check_parameters_conformance(t: TaskUnderTest) -> None:
-    """Check parameters: unique names, valid shapes and learning rates, start values that depend only on the seed."""
+    """Check the fields' parameters: unique names, valid shapes and rates, initial values set by the seed alone."""
     taken = {s.name for s in GEOMETRY_SPECS}
     for kind, spec in t.parameter_specs():
         where = f"{kind}.parameters: {spec.name!r}"
@@ -178,7 +185,11 @@ def check_parameters_conformance(t: TaskUnderTest) -> None:
 
 
 def check_evaluation_conformance(t: TaskUnderTest) -> None:
-    """Check the task's metrics, facts, clips and layers on its example, and that orbit views set every condition."""
+    """Check the functions with which a task evaluates a model, on its example data set or synthetic data.
+
+    These are metrics, masks, diagnostics, facts (header entries), clips (films) and layers (images of .exr files).
+    Views of an orbit must set every condition of the task, e.g. the time.
+    """
     task, data, model = t.task, t.dataset, t.perturbed_model(torch.float32)
     find_channels(task, data).display(data.test.pixels(0).over(data.background))
     before = {name: value.clone() for name, value in model.params.items()}
@@ -226,7 +237,7 @@ def check_loss_conformance(t: TaskUnderTest) -> None:
 
 
 def check_channels_conformance(t: TaskUnderTest) -> None:
-    """Check that ``build``, for data of 1 and of 5 channels, returns a colour field with as many or raises an error."""
+    """Check that ``build``, for data of 1 and of 5 channels, returns a colour field of as many channels, or raises."""
     if t.task.example is not None or t.task.channels:
         return  # only the task knows what data of other channels would look like, or there are no others
     declared = {}
@@ -270,7 +281,10 @@ def check_resume_conformance(t: TaskUnderTest) -> None:
 
 
 def check_save_load_conformance(t: TaskUnderTest) -> None:
-    """Check that a saved model loads with equal bits and images, and that compressing a model twice changes nothing."""
+    """Check that a saved model loads with equal bits and images, and that compressing a model again changes no bit.
+
+    The canonical parameters, which compressed files store, must give the same images up to 1e-4.
+    """
     model = t.perturbed_model(torch.float32)
     canonical = canonical_model(model)
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
@@ -294,7 +308,11 @@ def check_save_load_conformance(t: TaskUnderTest) -> None:
 
 
 def check_conditions_conformance(t: TaskUnderTest) -> None:
-    """Check that conditions parse text, refuse other text, render over their range, and are required for rendering."""
+    """Check the task's conditions (inputs of an image besides the camera, e.g. the time).
+
+    A condition must parse the text of a valid value and refuse other text. Images must be finite over its range.
+    Rendering without its value must raise an error that names it.
+    """
     model = t.perturbed_model(torch.float32)
     view = t.views[0]
     for spec in t.task.conditions:
@@ -408,7 +426,10 @@ def checks(task: TaskSpec, preset: str | None = None, model: Mapping[str, Any] |
 
 
 def _find_conformance_failure_line(error: BaseException) -> str:
-    """Return the innermost line of the task's own code, e.g. ``" in Waves.on_split (fields.py, line 12)"``, or ""."""
+    """Return where in the task's own code an error was raised, e.g. ``" in Waves.on_split (fields.py, line 12)"``.
+
+    The text is empty if no line of the traceback is the task's own.
+    """
     for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
         module = str(frame.f_globals.get("__name__", ""))
         if not module.startswith(_NOT_THE_TASKS) and module.split(".")[0] not in _LIBRARIES:

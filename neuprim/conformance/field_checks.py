@@ -23,7 +23,7 @@ _RAYS = 6
 _STEPS = (1e-5, 1e-6)
 """Step sizes of finite differences. A pixel that changes at a silhouette disturbs only one of them."""
 _MASS_EACH, _MASS_MEAN = 0.25, 0.05
-"""Tolerances of the children's mass if ``exact_split`` is False: relative error of one pair, and of the mean."""
+"""Largest relative error of the mass (integral of density) of two split children: of one pair, and of the mean."""
 
 
 # ---------------------------------------------------------------- points and rays
@@ -34,7 +34,11 @@ def _active_rows_under_test(active: ActivePrimitives) -> Tensor:
 
 
 def _integrate_under_test(active: ActivePrimitives, prim: Tensor, ray: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-    """Integrate sigma along chords by Gauss-Legendre quadrature on eight intervals; also return the largest |sigma|."""
+    """Integrate the density sigma along P chords by Gauss-Legendre quadrature, 16 points on each of eight intervals.
+
+    ``ray`` has origins (P, 3), directions (P, 3), and ray parameters (P,) of both ends of the chords. ``prim`` (P,) is
+    the index of each chord's primitive among the active ones. Return integrals (P,) and the largest |sigma| (P,).
+    """
     o, d, t0, t1 = ray
     x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(16))
     nodes = ((x[None] + 1) / 2 + torch.arange(8)[:, None]).reshape(-1) / 8
@@ -59,10 +63,10 @@ def _random_directions(count: int, generator: torch.Generator) -> Tensor:
 
 
 def random_chords(geometry: Geometry, rows: Tensor, generator: torch.Generator) -> tuple[Tensor, ...]:
-    """Draw M random rays; ray i starts outside the ellipsoid ``rows[i]`` and passes through it.
+    """Draw M random rays; ray i starts outside the ellipsoid of primitive ``rows[i]`` and passes through it.
 
     Returns:
-        origins (M, 3), directions (M, 3), and ray parameters (M,) of both ends of the chord, float64.
+        origins (M, 3), directions (M, 3), and ray parameters (M,) of entry into and exit from the ellipsoid; float64.
     """
     point = conformance_points_inside(geometry, rows, generator)
     d = _random_directions(len(rows), generator)
@@ -78,7 +82,10 @@ def random_chords(geometry: Geometry, rows: Tensor, generator: torch.Generator) 
 
 
 def check_activity_conformance(t: TaskUnderTest) -> None:
-    """Check ``active_rows``: rows are in ascending order, and primitives not listed have no density in the frame."""
+    """Check ``active_rows`` of the density field, which lists the primitives with density under a frame's conditions.
+
+    The indices must be ascending int64 numbers. Primitives that are not listed must have zero density in the frame.
+    """
     model = t.perturbed_model()
     generator = torch.Generator().manual_seed(3)
     params = model.of(model.density)
@@ -97,7 +104,10 @@ def check_activity_conformance(t: TaskUnderTest) -> None:
 
 
 def check_integral_conformance(t: TaskUnderTest) -> None:
-    """Check that ``density.lower`` gives the integrals of ``density.density`` over chords and over parts of chords."""
+    """Check that the closed-form integrals of ``density.lower`` agree with quadrature of ``density.density``.
+
+    Integrals are compared along chords (segments of rays inside an ellipsoid) and along parts of chords.
+    """
     model = t.perturbed_model()
     generator = torch.Generator().manual_seed(4)
     count = 0
@@ -130,7 +140,10 @@ def check_integral_conformance(t: TaskUnderTest) -> None:
 
 
 class _ShadingUnderTest(ColourField):
-    """Colour field with constant shading. Shading has no gradient, so finite differences must not change it."""
+    """Colour field that wraps a model's own, but with shading (factors on colours, e.g. shadows) computed only once.
+
+    Shading has no gradient, so it must not change with parameters, or finite differences would include the change.
+    """
 
     def __init__(self, model: Primitives, conditions: Conditions) -> None:
         self.colour, self.channels = model.colour, model.colour.channels
@@ -164,7 +177,7 @@ def _conformance_objective(model: Primitives, view: View, seed: int) -> Tensor:
 
 
 def check_gradients_conformance(t: TaskUnderTest) -> None:
-    """Check that every parameter has a gradient in some view, and that finite differences in float64 confirm it."""
+    """Check that every parameter has a gradient in some view, and that float64 finite differences confirm it."""
     model = t.perturbed_model()
     params = _leaf_parameters_under_test(model)
     for i, view in enumerate(t.double_views):
@@ -214,7 +227,7 @@ def _compare_with_differences(t: TaskUnderTest, model: Primitives, view: View, n
 
 
 def check_scaling_conformance(t: TaskUnderTest) -> None:
-    """Check that ``scale_density`` multiplies the density by its factor and returns new tensors."""
+    """Check that ``scale_density`` multiplies each primitive's density by the given factor and returns new tensors."""
     model = t.perturbed_model()
     factor = torch.linspace(0.25, 2.0, model.count, dtype=torch.float64)
     own = model.of(model.density)
@@ -235,7 +248,11 @@ def check_scaling_conformance(t: TaskUnderTest) -> None:
 
 
 def check_split_conformance(t: TaskUnderTest) -> None:
-    """Check ``on_split``: each child has its parent's density; without ``exact_split``, both together have its mass."""
+    """Check ``on_split``, which returns the parameters of two children that replace a primitive (their parent).
+
+    Inside a child, the child's density must equal the parent's. If the field has ``exact_split=False``, the
+    two children together must instead have the mass (integral of density) of the parent.
+    """
     model = t.perturbed_model()
     old, parents, colours = model.geometry, model.of(model.density), model.of(model.colour)
     axis = torch.nn.functional.one_hot(old.log_scales.argmax(-1), 3).double()
@@ -264,9 +281,10 @@ def check_split_conformance(t: TaskUnderTest) -> None:
 def _require_conforming_masses(
     t: TaskUnderTest, model: Primitives, children: list[tuple[dict[str, Tensor], Geometry]]
 ) -> None:
-    """Require that two children together have their parent's mass, the integral of |sigma|.
+    """Require that two children together have the mass of the primitive that they replace, the integral of |sigma|.
 
     The tolerance is larger for one pair than for the mean over all pairs, since sigma can vary within a primitive.
+    ``children`` has two pairs (parameters, ellipsoids), each for one child of every primitive.
     """
     view = t.double_views[0]
     ball = 2 * torch.rand(4000, 3, generator=torch.Generator().manual_seed(8), dtype=torch.float64) - 1
@@ -292,7 +310,10 @@ def _require_conforming_masses(
 
 
 def check_reductions_conformance(t: TaskUnderTest) -> None:
-    """Check that every reduction of a field returns a field of the task with fewer parameters that can be rendered."""
+    """Check the reductions that density and colour fields offer: smaller values of a setting, e.g. of the SH degree.
+
+    A reduced field must be one that the task lists, have fewer parameters, and give finite images.
+    """
     model = t.perturbed_model(torch.float32)
     for kind, field in (("density", model.density), ("colour", model.colour)):
         for name, values in field.reductions().items():

@@ -1,4 +1,4 @@
-"""The task under test of the conformance checks, with models, data and trainers built from it."""
+"""The class of a task under test, from which conformance checks build models, data and trainers; synthetic data."""
 
 from __future__ import annotations
 
@@ -29,17 +29,18 @@ from neuprim.core.train.trainer import Trainer
 
 PRIMITIVES = 12
 EXACT = RenderSettings(backend=REFERENCE, alpha_max=0.9999, alpha_min=0.0, transmittance_min=0.0, depth_floor=1e-12)
-"""Render settings that skip nothing and clamp only what must be clamped."""
+"""Render settings, for the float64 reference, that skip no contribution to a pixel and clamp as little as possible."""
 
 
 class ConformanceError(AssertionError):
-    """Error: a task violates the interface. The message has task, check and member, and what was found and expected."""
+    """Error: a task violates the interface. The message has task, check, place, and what was found and expected."""
 
 
 class TaskUnderTest:
-    """A task with one choice of settings, as conformance checks use it.
+    """A task to check, with one choice of settings, and methods that build models from it and compare results.
 
     Args:
+        task: the task to check.
         check: name of the running check, for messages.
         preset: name of the preset for the model settings; None is the task's default preset.
         model: changes to these model settings by name, e.g. ``{"density": {"form": "gaussian"}}``.
@@ -57,13 +58,13 @@ class TaskUnderTest:
         return other
 
     def with_channels(self, channels: int) -> TaskUnderTest:
-        """Return a copy whose data set is synthetic and has ``channels`` colour channels."""
+        """Return a copy whose data set is :func:`conformance_dataset`, with ``channels`` colour channels."""
         other = copy(self)
         other.dataset = conformance_dataset(self.task.conditions, channels)
         return other
 
     def require(self, ok: bool, where: str, found: object, expected: object) -> None:
-        """Raise :class:`ConformanceError` unless ``ok``; the message has ``where``, ``found`` and ``expected``."""
+        """Raise :class:`ConformanceError` unless ``ok``. Message: "task, check: ``where``: found ...; expected ..."."""
         if not ok:
             raise ConformanceError(
                 f"task {self.task.name!r}: {self.check}: {where}: found {found}; expected {expected}"
@@ -83,7 +84,10 @@ class TaskUnderTest:
             self.require_finite(f"{where}: {name}", found[name])
 
     def require_close(self, where: str, found: Tensor, expected: Tensor, rows: Tensor) -> None:
-        """Raise :class:`ConformanceError` unless found and expected values differ by at most 1e-6 of the largest."""
+        """Raise :class:`ConformanceError` if two vectors (M,) differ by more than 1e-6 of the largest expected value.
+
+        ``rows`` (M,) has the index of the primitive that each value belongs to, for the message.
+        """
         if len(rows):
             error = (found - expected).abs() / expected.abs().max().clamp_min(1e-30)
             i = int(error.argmax())
@@ -107,7 +111,7 @@ class TaskUnderTest:
 
     @cached_property
     def settings(self) -> RunSettings:
-        """Settings of the preset, with few primitives and the reference backend."""
+        """Settings of the preset, with 12 primitives, the changes of the model settings, and the reference backend."""
         choice = read_task_config(self.task)
         found = preset_settings(self.task, self.preset or choice.preset, choice.scene)
         model = replace(found.model, **{"primitives": PRIMITIVES, **self.changes})
@@ -141,7 +145,7 @@ class TaskUnderTest:
         return found
 
     def build_fields(self) -> tuple[DensityField, ColourField]:
-        """Build new density and colour fields."""
+        """Build the task's density field and colour field (the functions that primitives share)."""
         return self.task.build(build_settings(self.task, self.settings.model, self.options), self.dataset)
 
     def parameter_specs(self) -> list[tuple[str, ParameterSpec]]:
@@ -150,7 +154,10 @@ class TaskUnderTest:
         return [*(("density", s) for s in density.parameters()), *(("colour", s) for s in colour.parameters())]
 
     def lower_method(self, parameter: str) -> str:
-        """Return the method through which a parameter affects the image, for messages, e.g. ``"density.lower: "``."""
+        """Return the method through which a parameter affects the image, for messages, e.g. ``"density.lower: "``.
+
+        The text is empty for parameters of the ellipsoids.
+        """
         kind = next((kind for kind, spec in self.parameter_specs() if spec.name == parameter), None)
         return "" if kind is None else f"{kind}.lower: "
 
@@ -172,7 +179,7 @@ class TaskUnderTest:
         return model
 
     def trainer(self, iterations: int) -> Trainer:
-        """Return a trainer of a new model, with population control every second step."""
+        """Return a trainer of a new model that relocates primitives (population control) every second step."""
         model, train = self.initial_model(), self.settings.train
         population = PopulationSettings(strategy="relocate", every=2, start=0.0, stop=1.0, fraction=0.2)
         rates = {name: rate for name, rate in train.rates.items() if name in model.params}
@@ -200,7 +207,10 @@ def conformance_range(spec: ConditionSpec) -> tuple[float, float]:
 def random_conformance_condition(
     spec: ConditionSpec, generator: torch.Generator, shape: tuple[int, ...] | None = None
 ) -> Tensor:
-    """Draw a float32 value of a condition, uniform in :func:`conformance_range`; default shape ``spec.shape``."""
+    """Draw a random float32 value of a condition (such as the time), uniform in :func:`conformance_range`.
+
+    ``shape`` is the shape of the result; None is the shape of the condition.
+    """
     low, high = conformance_range(spec)
     return low + (high - low) * torch.rand(spec.shape if shape is None else shape, generator=generator)
 
@@ -222,9 +232,10 @@ class _ConformanceViews(ViewSet):
 
 
 def conformance_dataset(conditions: tuple[ConditionSpec, ...], channels: int = 3) -> Dataset:
-    """Make a data set of six training and two test views, 10 x 9 pixels, sRGB: ellipsoids of constant density on grey.
+    """Make a small synthetic data set: six training and two test views, 10 x 9 pixels, sRGB.
 
-    The conditions have random values; the images do not depend on them.
+    The images show ellipsoids of constant density on grey. Each view has random values of the conditions (inputs such
+    as the time); the images do not depend on these values.
     """
     generator = torch.Generator().manual_seed(7)
     views = []

@@ -46,7 +46,10 @@ class Channels:
 
     @property
     def rgb(self) -> tuple[int, int, int] | None:
-        """Indices of R, G and B by name; else (0, 1, 2) for three channels, (0, 0, 0) for one, None otherwise."""
+        """Indices of the channels named R, G and B; without these names, of those to show as red, green and blue.
+
+        The latter are (0, 1, 2) for three channels and (0, 0, 0) for one; None for other numbers.
+        """
         if {"R", "G", "B"} <= set(self.names):
             return self.names.index("R"), self.names.index("G"), self.names.index("B")
         return {1: (0, 0, 0), 3: (0, 1, 2)}.get(self.count)

@@ -41,7 +41,7 @@ __all__ = ["load_model_checkpoint", "read_header", "save_model"]
 FORMAT = 1
 _KEY = "neuprim"
 _NUMBERS = ("step", "elapsed", "views", "iterations", "train_seconds", "primitives")
-"""Header entries that reading checks: each is null, missing, or a number of at least 0."""
+"""Header entries that are checked when a file is read: each is null, missing, or a number of at least 0."""
 
 
 def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
@@ -137,7 +137,7 @@ def read_tensors(
 
 
 def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any], without_zeros: bool = False) -> None:
-    """Write a model file, all that rendering needs. An interrupted write leaves no partial file.
+    """Write a model file, which holds all that rendering needs. An interrupted write leaves no partial file.
 
     Args:
         task: name of the task.

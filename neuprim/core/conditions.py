@@ -21,14 +21,14 @@ from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.model.fields import ConditionSpec
 
 FRAMES = 60
-"""Number of frames of a range without ``COUNT``."""
+"""Number of frames of a range ``FIRST:LAST`` without ``COUNT``."""
 
 _MOST = 100_000
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _RANGE = re.compile(rf"({_NUMBER}):({_NUMBER})(?::([+-]?\d+))?")
 
 Warn = Callable[[str], None]
-"""Called with one line for the user."""
+"""Function that shows a warning, one line of text, to the user."""
 
 
 def _ignore_condition_warning(text: str) -> None:
@@ -228,9 +228,10 @@ def _format_condition_number(number: float) -> str:
 
 
 def _check_condition_range(spec: ConditionSpec, text: str, values: Sequence[Tensor], warn: Warn) -> None:
-    """Check every element of a condition's values against its range.
+    """Check a condition's values against its range; ``warn`` of values outside, or raise ConfigError if it is strict.
 
-    Bounds are rounded to the dtype of the values, so that float32 0.3 lies within 0 to 0.3.
+    Values that are not finite always raise ConfigError. Bounds are rounded to the dtype of the values, so that float32
+    0.3 lies within 0 to 0.3.
     """
     low, high = spec.range
     shown = f"{condition_flag(spec.name)} {text}"

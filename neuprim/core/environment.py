@@ -160,7 +160,7 @@ def read_environment(path: Path, up: Tensor | None = None, rotation: float = 0.0
 
 
 def _environment_axes(up: Tensor) -> Array:
-    """Return the axes as rows (3, 3): first horizontal axis, second, up."""
+    """Return the axes of an environment map as rows of a (3, 3) matrix: first and second horizontal axis, and up."""
     top = up.detach().double().numpy()
     length = np.linalg.norm(top)
     if not (np.isfinite(length) and length > 0):
@@ -173,7 +173,11 @@ def _environment_axes(up: Tensor) -> Array:
 
 
 def _sum_texel_blocks(radiance: Tensor, axes: Array, turn: float, where: str) -> tuple[Array, Array]:
-    """Return two (R, C, 3) sums over texel blocks: flux (radiance x solid angle), and its luminance x direction."""
+    """Sum an environment map over blocks of texels; return flux and direction sums, (R, C, 3) for R x C blocks.
+
+    The flux is radiance x solid angle, per colour channel. The direction sum is that of the flux's luminance x
+    direction. ``turn`` is the rotation in radians, ``where`` the image's name in messages.
+    """
     height, width = radiance.shape[:2]
     block = -(-height // _ROWS)
     starts = np.arange(0, width, block)
@@ -201,7 +205,10 @@ def _sum_texel_blocks(radiance: Tensor, axes: Array, turn: float, where: str) ->
 
 
 def _cut_environment_into_rectangles(moment: Array, weight: Array, count: int) -> list[tuple[int, int, int, int]]:
-    """Return at most ``count`` rectangles (first row, end, first column, end) that contain all cells with energy."""
+    """Return at most ``count`` rectangles (first row, end, first column, end) that contain all cells with energy.
+
+    ``moment`` (R, C, 3) is the sum of luminance x direction in each cell, ``weight`` (R, C) that of luminance.
+    """
     rows, columns = weight.shape
     table = np.zeros((rows + 1, columns + 1, 4))
     table[1:, 1:] = np.concatenate([moment, weight[..., None]], -1).cumsum(0).cumsum(1)
@@ -227,7 +234,8 @@ def _sum_rectangle(table: Array, box: tuple[int, int, int, int]) -> Array:
 
 
 def _direction_spread(sums: Array) -> Array:
-    """Return energy times variance of direction, W - |M|^2/W, from (..., 4) sums: the vector M, then W."""
+    """Return energy x variance of direction, W - |M|^2/W, from sums (..., 4): luminance x direction M, then luminance
+    W."""
     weight = sums[..., 3]
     return np.asarray(np.maximum(weight - (sums[..., :3] ** 2).sum(-1) / np.maximum(weight, 1e-300), 0.0))
 
@@ -235,7 +243,10 @@ def _direction_spread(sums: Array) -> Array:
 def _cut_environment_rectangle(
     table: Array, box: tuple[int, int, int, int], least: float
 ) -> list[tuple[int, int, int, int]]:
-    """Return the two parts after the best cut of rectangle ``box``; empty if no cut lowers the spread by ``least``."""
+    """Return the two parts after the best cut of rectangle ``box``; empty if no cut lowers the spread by ``least``.
+
+    ``table`` (R + 1, C + 1, 4) holds cumulative sums of the values that :func:`_direction_spread` reads.
+    """
     r0, r1, c0, c1 = box
     whole = _sum_rectangle(table, box)
     best, parts = float(_direction_spread(whole)) - least, []

@@ -22,7 +22,8 @@ DISK = (
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO),
     *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP),
 )
-"""Error codes of disks and paths that users can correct; ENOENT is not one, as a missing file may be a bug."""
+"""Codes of operating-system errors about disks and paths that users can correct, without ENOENT: a missing file may be
+a bug."""
 
 
 class NeuprimError(Exception):
@@ -116,7 +117,7 @@ _said: set[str] = set()
 
 
 def warn_once(text: str) -> None:
-    """Warn, unless this process has given the same warning before."""
+    """Emit the warning ``text``, unless this process has emitted the same text before."""
     if text not in _said:
         _said.add(text)
         warnings.warn(text, NeuprimWarning, stacklevel=3)
@@ -124,7 +125,7 @@ def warn_once(text: str) -> None:
 
 @contextmanager
 def warnings_as_lines() -> Iterator[None]:
-    """Print neuprim's warnings inside the block as ``neuprim: warning: ...`` on standard error; other warnings stay."""
+    """Print neuprim's warnings inside the block as ``neuprim: warning: ...`` on standard error; leave others."""
     previous = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:

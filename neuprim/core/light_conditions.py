@@ -104,15 +104,15 @@ LIGHT_CONDITIONS = (
     ),
     ConditionSpec("light_intensity", (3,), "radiometric", (0.0, 1e6), parse_light_intensities),
 )
-"""Position of a light, and its intensity."""
+"""Conditions of a scene lit by one point light: the light's position and intensity."""
 
 
 # ---------------------------------------------------------------- environments
 
 
 def summarize_lights(lights: Tensor, center: Tensor, falloff: str, exposure: float) -> dict[str, Any]:
-    """Summarise training lights (L, 3) for a model's header: mean distance and at most 256 directions, chosen by
-    farthest-point sampling."""
+    """Return JSON-able facts on the training lights ``lights`` (L, 3) for a model's header: their mean distance from
+    ``center``, at most 256 directions by farthest-point sampling, ``falloff`` and ``exposure``."""
     offsets = lights.double() - center.double()
     distance = offsets.norm(dim=-1)
     units = offsets / distance.clamp_min(1e-30)[:, None]

@@ -72,7 +72,7 @@ class Chunk:
 
 @dataclass(frozen=True)
 class Chunks:
-    """The chunks of a scene that is trained in chunks.
+    """The parts (chunks) into which a scene is divided, each trained as a run of its own.
 
     Attributes:
         parts: the chunks, two or more.

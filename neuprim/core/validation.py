@@ -211,7 +211,7 @@ def _choice_type_to_validate(kind: Any) -> Any:
 
 
 class _UnfitValue(ConfigError):
-    """A value that is not what its field expects."""
+    """Error for a setting's value that has a wrong type or is out of bounds."""
 
     def __init__(self, where: str, value: object, expected: str) -> None:
         super().__init__(f"{where}={format_setting_value(value)}: expected {expected}")

@@ -44,7 +44,7 @@ from neuprim.core.task import API_VERSION
 from neuprim.export.shared import ExportHarmonics, choose_export_views, find_export_rgb_channels, fit_export_harmonics
 
 SIZES = ("moments", "footprint", "profile")
-"""Quantities to which the size of a Gaussian can be fitted."""
+"""Methods to choose the size of a Gaussian; :func:`fit_gaussians` describes them."""
 _SIDE = 12  # points of the quadrature along an axis of the unit ball
 _CHUNK = 512
 _FACTORS = [1.06**i for i in range(-24, 25)]  # on the covariance, in steps of three percent in size
@@ -189,7 +189,7 @@ class Gaussians:
     rows: Tensor
 
     def to_scene(self, world: World) -> Gaussians:
-        """Transform these Gaussians from world coordinates to the scene coordinates of ``world``."""
+        """Return these Gaussians, given in world coordinates, in scene coordinates; ``world`` holds the transform."""
         if world.identity:
             return self
         linear = world.scene_from_world[:3, :3]
@@ -280,10 +280,15 @@ def _fit_gaussian_ply_profile(
 ) -> tuple[Tensor, Tensor]:
     """Fit size="profile" of :func:`fit_gaussians`: return (n,) factors on the covariance, and (n,) opacities.
 
-    Each of the three ``screens`` is a projection of n primitives along an axis: (alpha, covariance, mean, area). On the
-    image plane, alpha has the integrals ``areas`` (3, n), and the unscaled Gaussian of opacity 1 has ``bells`` (3, n).
     The fit tries a list of factors. For each, the opacity preserves the integral of alpha, but is at most 0.99. The
     factor with the smallest squared error wins. The error includes the Gaussian's part outside of the image.
+
+    Args:
+        screens: for each of three axes, the image of n primitives, projected along the axis: (n, S, S) alpha; (n, 2, 2)
+            covariance and (n, 2) mean of the Gaussian; (n,) weight of the image, the product of its two semi-axes.
+        areas: (3, n) integrals of alpha over the images.
+        bells: (3, n) integrals of the unscaled Gaussian with opacity 1 over the image plane.
+        ticks: (S,) coordinates of the pixel centres, from -1 to 1 (semi-axes of the ellipsoid).
     """
     step = ticks[1] - ticks[0]
     weights = torch.stack([screen[3] for screen in screens])

@@ -104,7 +104,10 @@ def _make_html_export_draw(run: TrainedModel) -> DrawView:
 def _measure_html_export_psnr(
     job: ExportJob, stored: Primitives, views: Sequence[PageView], conditions: Mapping[str, Tensor]
 ) -> float:
-    """Return the PSNR, dB, of images of the ``stored`` model against the run's model, on ``views`` or else an orbit."""
+    """Return the PSNR, dB, of images of the ``stored`` (compressed) model against images of the run's model.
+
+    The images show the first of ``views`` or, if there are none, an orbit under ``conditions``.
+    """
     model = job.run.model
     if not views and not model.active(conditions).geometry.count:
         return math.inf  # both images are the background

@@ -63,7 +63,7 @@ _SUFFIXES = (".glb", ".ply", ".obj")
 _CHUNK = 2_000_000
 _MOST_VOXELS = 2**29
 _TO_GLTF = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""Scene (z up) to glTF (y up): x, z, -y."""
+"""(4, 4) rotation from scene axes (z up) to glTF axes (y up): (x, y, z) becomes (x, z, -y)."""
 
 
 def _write_mesh(job: ExportJob) -> ExportReport:
@@ -141,9 +141,9 @@ def _sample_exported_density(job: ExportJob, conditions: Conditions, count: int)
 def find_export_surface_level(sigma: np.ndarray, step: float) -> float:
     """Find the extinction whose isosurface best matches the opaque regions of a grid.
 
-    Columns of voxels are compared along all three axes. The mesh covers a column if its largest extinction exceeds the
-    level. The model covers a column if its optical depth exceeds ln 2 (alpha 1/2), or half of the largest optical depth
-    if that is smaller. The result is the level at which mesh and model agree on the most columns.
+    Columns of voxels are compared along all three axes. The mesh covers a column if its highest extinction exceeds the
+    level. The model covers a column if its optical depth exceeds ln 2 (alpha 1/2), or half of the largest optical
+    depth if that is smaller. The result is the level at which mesh and model agree on the most columns.
 
     Args:
         sigma: (X, Y, Z) extinction, 1/scene unit.
@@ -163,7 +163,7 @@ def find_export_surface_level(sigma: np.ndarray, step: float) -> float:
 
 
 def _drop_small_pieces(mesh: Any, keep: float) -> tuple[Any, int]:
-    """Drop components whose area is below ``keep`` times the largest; return the mesh and the number dropped."""
+    """Remove connected components with less area than ``keep`` times the largest; return mesh and number removed."""
     import trimesh
 
     if keep <= 0:
@@ -181,7 +181,11 @@ def _drop_small_pieces(mesh: Any, keep: float) -> tuple[Any, int]:
 def _exported_vertex_colours(
     job: ExportJob, conditions: Conditions, colours: ExportHarmonics, points: np.ndarray, normals: np.ndarray
 ) -> np.ndarray:
-    """Return (V, C) vertex colours: the density-weighted mean of the primitives at a vertex, else the nearest one's."""
+    """Return (V, C) colours of mesh vertices at ``points`` (V, 3), seen from outside along ``normals`` (V, 3).
+
+    A vertex has the mean colour of the primitives that contain it, weighted by their densities there. Outside all
+    primitives, it has the colour of the primitive with the nearest centre. ``colours`` are those of the primitives.
+    """
     with torch.no_grad():
         active = job.run.model.active(conditions)
         moved = active.geometry

@@ -46,7 +46,7 @@ class ExportHarmonics:
         return (mixed + 0.5).clamp_min(0.0)
 
     def rotate(self, rotation: Tensor | None) -> ExportHarmonics:
-        """Return these colours after a rotation of the axes by ``rotation`` (3, 3); exact in each SH band."""
+        """Return these colours after the axes are rotated by ``rotation`` (3, 3) or None; exact in each SH band."""
         if rotation is None:
             return self
         directions = fibonacci_sphere(_DIRECTIONS)
@@ -149,7 +149,7 @@ def choose_export_views(job: ExportJob, which: str, conditions: Conditions) -> t
 
 
 def find_export_box(job: ExportJob, frames: Sequence[Conditions]) -> tuple[Tensor, Tensor]:
-    """Return lower and upper corner (3,) float64, scene units, of the bounding box of the primitives in all frames.
+    """Return the bounding box of the active ellipsoids in all frames: lower and upper corner (3,) float64, scene units.
 
     Raises:
         ConfigError: no primitive is active in any of the frames.

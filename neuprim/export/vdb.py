@@ -63,7 +63,11 @@ _MOST_VOXELS = 2**34
 
 @dataclass(frozen=True)
 class _GridFrame:
-    """A frame to write: its number in the file name, its conditions, and its index in the source (None: not there)."""
+    """A frame to write: its number in the file name, and its conditions.
+
+    ``source`` is the index of the frame with equal conditions in the source (the .vdb files that the model was fitted
+    to); None if the source has no such frame.
+    """
 
     number: int
     conditions: Conditions
@@ -138,7 +142,10 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
 
 
 def _exported_component(job: ExportJob, placement: DensityGridPlacement | None) -> Primitives:
-    """Return the model to export. If flames add to its extinction, keep only the part of the source's extinction grid.
+    """Return the model to export, whose extinction can be compared with the source's grid of extinctions.
+
+    If flames add to the model's extinction, the result has only the part that comes from this grid. The source is the
+    set of .vdb files that the model was fitted to; without it (``placement`` is None), return the run's model.
 
     Raises:
         ConfigError: the model has not learned this part separately.
@@ -176,7 +183,10 @@ def _clamp_exported_grid(grid: VdbGrid, extent: GridExtent, per_unit: float) -> 
 def _find_export_source(
     job: ExportJob,
 ) -> tuple[DensityGridSource | None, DensityGridPlacement | None, list[str]]:
-    """Return the source's .vdb files or None, their placement in the world or None, and messages for the user."""
+    """Find the source of a model: the .vdb files that it was fitted to.
+
+    Return the files, None if they cannot be used; their placement, None if there is no source; messages for the user.
+    """
     notes: list[str] = []
     source = None
     try:
@@ -195,7 +205,10 @@ def _find_export_source(
 
 
 def _list_export_frames(job: ExportJob, placement: DensityGridPlacement | None) -> list[_GridFrame]:
-    """List the frames to write: those that the user names, else all of the source. A static model has one."""
+    """List the frames to write: the frames that the user names, else all frames of the model's source .vdb files.
+
+    A model without conditions, such as the time, has one frame.
+    """
     if not job.run.task.conditions:
         return [_GridFrame(0, {})]
     if job.conditions or placement is None:
@@ -239,7 +252,12 @@ def _name_vdb_files(job: ExportJob, frames: list[_GridFrame]) -> list[Path]:
 def _export_voxel_transform(
     job: ExportJob, box: np.ndarray, scene_from_world: np.ndarray, origin: np.ndarray
 ) -> np.ndarray:
-    """Return (4, 4) world_from_index for the options ``grid`` or ``voxel_size``; index 0 is at ``origin`` (3,)."""
+    """Return the (4, 4) transform world_from_index of cubic voxels, for the option ``grid`` or ``voxel_size``.
+
+    Args:
+        box: (2, 3) corners of the model's bounding box, scene units.
+        origin: (3,) position of voxel (0, 0, 0), world units.
+    """
     count, size = job.count("grid", 8, 2048), job.number("voxel_size", 1e-9, 1e9)
     if count is not None and size is not None:
         raise ConfigError("grid and voxel_size: both are given; expected one of them")
@@ -251,7 +269,10 @@ def _export_voxel_transform(
 
 
 class _VdbExportSampler(NamedTuple):
-    """Sampler of extinction on voxels. It multiplies by ``factor``; results below ``threshold`` become background."""
+    """Sampler of a model's extinction on voxels, into a grid called ``name``.
+
+    Extinctions (1/scene unit) are multiplied by ``factor``. Products below ``threshold`` are not stored.
+    """
 
     job: ExportJob
     model: Primitives
@@ -297,7 +318,10 @@ class _VdbExportSampler(NamedTuple):
     def _sample_blocks(
         self, conditions: Conditions, scene_from_index: np.ndarray, first: np.ndarray, size: np.ndarray
     ) -> Iterator[VdbGrid]:
-        """Yield one sparse grid per block. Memory limits the blocks; their x and y sides are multiples of 8 voxels."""
+        """Yield one sparse grid per block of voxels. A dense block fits into about 64 MiB.
+
+        Their x and y sides are multiples of 8 voxels. All blocks together start at index ``first`` and have ``size``.
+        """
         settings = self.job.run.settings
         rows = max(8, min(int(size[1]), _SLAB_BYTES // (32 * int(size[2])) & ~7))
         planes = max(8, min(int(size[0]), _SLAB_BYTES // (4 * rows * int(size[2])) & ~7))

@@ -26,12 +26,12 @@ _LEAVES = 512  # evaluated at once, with about 64 MB of sums
 
 @dataclass(frozen=True)
 class VelocityExport:
-    """Settings of the grid ``vel``.
+    """Settings and sampler of the OpenVDB grid ``vel``, the velocity of the primitives.
 
     Attributes:
         interval: units of the condition "time" per second or per frame.
-        unit: unit of the values, for metadata.
-        scene_from_world: (4, 4) float64.
+        unit: unit of the velocities, for metadata.
+        scene_from_world: (4, 4) float64 transform from world to scene coordinates.
         threads: number of threads, 0 for all cores.
     """
 
@@ -63,13 +63,13 @@ class VelocityExport:
 
 @dataclass(frozen=True)
 class LookExport:
-    """Settings of the grids ``emission`` and ``albedo``.
+    """Settings and sampler of the OpenVDB grids ``emission`` and ``albedo``.
 
     Attributes:
         names: the grids to write.
         exposure: the radiance that the value 1 of a training image stands for.
         per_world: scene units per world unit.
-        scene_from_world: (4, 4) float64.
+        scene_from_world: (4, 4) float64 transform from world to scene coordinates.
         threads: number of threads, 0 for all cores.
     """
 
@@ -82,7 +82,7 @@ class LookExport:
     def sample_grids(self, model: Primitives, conditions: Conditions, extinction: VdbGrid) -> list[VdbGrid]:
         """Return the grids of a frame, with the active voxels of ``extinction``.
 
-        ``emission`` is the sum of extinction times colour without the frame's light, radiance per world unit.
+        ``emission`` is the sum over primitives of extinction times emitted colour, radiance per world unit.
         ``albedo`` is the mean scattering albedo of the primitives, weighted by their extinctions.
         """
         with torch.no_grad():
@@ -96,7 +96,11 @@ class LookExport:
         return [vector_grid(n, extinction, found[n], {"neuprim_units": units[n]}) for n in self.names]
 
     def measure_errors(self, model: Primitives, conditions: Conditions, truth: VoxelLook) -> dict[str, float]:
-        """Return errors of emission, and of albedo times extinction, on the voxels of a frame of the source."""
+        """Return name -> error of emission, and of albedo times extinction, against one frame of .vdb files.
+
+        ``truth`` has the emission and scattering of this frame at its voxels, from the files that the model was fitted
+        to.
+        """
         points = torch.from_numpy(truth.points)
         with torch.no_grad():
             active, form, weights = self._weights(model, conditions)
@@ -112,7 +116,10 @@ class LookExport:
         return found
 
     def _weights(self, model: Primitives, conditions: Conditions) -> tuple[ActivePrimitives, LoweredDensity, Tensor]:
-        """Return the primitives of a frame, their density, and (N, 3 or 6) emission and albedo."""
+        """Return the N active primitives of a frame, their density, and their emission and albedo as one tensor.
+
+        The tensor is (N, 6): emitted radiance (RGB), then scattering albedo. Without scattering it is (N, 3).
+        """
         active = model.to(device.HOST).active(conditions)
         params = {spec.name: active.params[spec.name] for spec in model.colour.parameters()}
         emitted, scattered = model.colour.isotropic(params, conditions), model.colour.scattering(params)
@@ -126,7 +133,7 @@ class LookExport:
 def choose_look(
     job: ExportJob, conditions: Conditions, per_world: float, scene_from_world: np.ndarray
 ) -> LookExport | None:
-    """Return the settings of the options ``emission`` and ``albedo``; None if neither is asked for.
+    """Return the sampler of the grids that the options ``emission`` and ``albedo`` ask for; None for neither.
 
     Raises:
         ConfigError: the colours of the model do not contain what is asked for.
@@ -160,9 +167,10 @@ def sum_at_voxels(
     scene_from_world: np.ndarray,
     threads: int,
 ) -> np.ndarray:
-    """Return (L, 8, 8, 8, 1 + C) sums over primitives, of extinctions and of extinctions times ``weights`` (N, C).
+    """Sum values of N primitives at the centres of the active voxels of ``grid``, which has L leaves of 8^3 voxels.
 
-    They are those at the centres of the active voxels of ``grid``; 0 elsewhere.
+    ``form`` is the closed form of the density. Return (L, 8, 8, 8, 1 + C): the sum of extinctions, then the sums of
+    extinctions times ``weights`` (N, C). Inactive voxels have 0.
     """
     values = np.zeros((*grid.masks.shape, 1 + weights.shape[1]), np.float32)
     scene_from_index = scene_from_world @ grid.transform
@@ -182,7 +190,7 @@ def _ratio(sums: np.ndarray, total: np.ndarray) -> np.ndarray:
 
 
 def vector_grid(name: str, like: VdbGrid, values: np.ndarray, metadata: dict[str, str]) -> VdbGrid:
-    """Return a grid of vectors (L, 8, 8, 8, 3) with the voxels of another grid."""
+    """Return an OpenVDB grid of vectors ``values`` (L, 8, 8, 8, 3), with the L leaves and voxels of grid ``like``."""
     tree = (np.zeros(3, np.float32), like.origins, values, like.masks, VdbTiles.none(3))
     return VdbGrid(name, like.transform, *tree, kind="unknown", half=like.half, metadata=metadata)
 
@@ -190,7 +198,7 @@ def vector_grid(name: str, like: VdbGrid, values: np.ndarray, metadata: dict[str
 def choose_velocity(
     job: ExportJob, model: Primitives, frames: Sequence[Conditions], scene_from_world: np.ndarray
 ) -> VelocityExport | None:
-    """Return the settings of the options ``velocity`` and ``fps``; None if no velocity is asked for.
+    """Return the sampler of the grid that the option ``velocity`` asks for; None without this option.
 
     Raises:
         ConfigError: the primitives do not move, or the interval between frames is unknown.

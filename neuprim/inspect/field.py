@@ -1,4 +1,7 @@
-"""Frames for the inspectors: a model's density on a grid, with the ground truth if there is one."""
+"""Input of the inspectors: frames of a model, with its density on a grid and the ground truth if there is one.
+
+Also functions that choose the frames and the box of the grid, and open the ground truth.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,7 @@ class InspectionFrame:
     Attributes:
         scene_from_index: (4, 4) transform from grid index to scene; the axes are parallel to the scene's.
         top: upper end of the colour scale of the extinction, 1/scene unit; the same for all frames.
-        gain: factor on the opacity of :class:`~neuprim.inspect.layers.Volume`; the same for all frames.
+        gain: factor on the optical depth of :class:`~neuprim.inspect.layers.Volume`; the same for all frames.
         focus: (3,) centre of the extinction of all frames, scene units.
         levels: extinctions of isosurfaces, 1/scene unit; by default a tenth, a third and two thirds of ``top``.
         primitive: index of the primitive to show alone; None for the primitive that absorbs most.
@@ -88,7 +91,10 @@ class InspectionFrame:
 
     @property
     def sigma(self) -> np.ndarray:
-        """Extinction, (X, Y, Z) float32: of the model, primitives clamped at 0, or, on side "truth", of the truth."""
+        """Extinction at the grid points, (X, Y, Z) float32, 1/scene unit.
+
+        If :attr:`side` is "model": the sum over primitives, each clamped at 0 from below. If "truth": the ground truth.
+        """
         if self.side not in self._grids:
             if self.side == "model":
                 grid = density_grid(self.model, self.conditions, self.scene_from_index, self.shape).numpy()
@@ -106,7 +112,7 @@ class InspectionFrame:
 
     @cached_property
     def active(self) -> ActivePrimitives:
-        """Primitives that are active in this frame, without gradients."""
+        """Primitives that are active (have extinction under the frame's conditions), without gradients."""
         with torch.no_grad():
             return self.model.active(self.conditions)
 
@@ -122,12 +128,12 @@ class InspectionFrame:
 
     @cached_property
     def masses(self) -> np.ndarray:
-        """Integral of the extinction over each active primitive, (M,) float64; see :func:`measure_absorption`."""
+        """Integral of the extinction over the volume of each of M active primitives; see :func:`measure_absorption`."""
         return measure_absorption(self.active)
 
     @cached_property
     def colours(self) -> np.ndarray:
-        """Display-referred colours at the primitives' centres, (M, 3) float32, seen from the first viewpoint."""
+        """Display-referred colours of the M active primitives' centres, (M, 3) float32, seen from one fixed point."""
         low, high = self.box
         center = torch.from_numpy((low + high) / 2).float()
         eye = center + torch.tensor([1.0, -1.6, 0.7]) * float(np.linalg.norm(high - low))
@@ -154,7 +160,10 @@ class InspectionFrame:
 
 
 def measure_absorption(active: ActivePrimitives) -> np.ndarray:
-    """Estimate the integral of max(0, sigma) of each primitive: mean at 33 points times volume; (M,) float64."""
+    """Estimate the integral of max(0, sigma) over each active primitive, (M,) float64.
+
+    sigma is the extinction. The estimate is its mean at 33 points of the ellipsoid times the ellipsoid's volume.
+    """
     i = torch.arange(33)
     radius, height, angle = ((i + 0.5) / 33) ** (1 / 3), 1 - 2 * ((i * 0.618034 * 7 + 0.5) % 1), i * 2.399963
     ring = (1 - height**2).clamp_min(0).sqrt()
@@ -250,7 +259,7 @@ def _inspection_box_quantile(values: np.ndarray, weights: np.ndarray, part: floa
 
 
 def open_inspection_truth(path: str, volume: Callable[[], DensityGridSource | None]) -> tuple[DensityTruth, str]:
-    """Open the ground-truth density that the user named; return it and a one-line description.
+    """Open the ground-truth density of ``--against``; return the density and a one-line description.
 
     Args:
         path: an OpenVDB file, a folder of OpenVDB files, or "scene" for the files of the run's scene.
@@ -270,7 +279,7 @@ def open_inspection_truth(path: str, volume: Callable[[], DensityGridSource | No
 
 
 def pair_inspected_frames(frames: Sequence[Conditions], truth: DensityTruth) -> list[tuple[Conditions, int]]:
-    """Pair each frame with the nearest frame of the ground truth.
+    """Pair each frame of the model, given by its conditions, with the ground-truth frame of the nearest conditions.
 
     Return pairs (conditions, index of the ground-truth frame) without duplicates. The conditions of a pair are those
     of its ground-truth frame.
@@ -287,7 +296,7 @@ def pair_inspected_frames(frames: Sequence[Conditions], truth: DensityTruth) -> 
 
 
 def write_inspection_vdb(path: Path, frame: InspectionFrame, world: World) -> None:
-    """Write the frame's extinction, 1/scene unit, as an OpenVDB file in ``world``; one voxel per grid point."""
+    """Write the frame's extinction, 1/scene unit, as an OpenVDB file in world coordinates; one voxel per grid point."""
     scalars = {f"neuprim_condition_{name}": float(x) for name, x in frame.conditions.items() if x.numel() == 1}
     metadata = {"neuprim_value": "extinction, 1/scene unit; each primitive clamped at 0 from below", **scalars}
     transform = world.world_from_scene.numpy() @ frame.scene_from_index.numpy()

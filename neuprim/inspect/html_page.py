@@ -107,17 +107,18 @@ def _inspection_frame_data(frame: InspectionFrame, views: Sequence[Inspector], u
 
 
 def encode_inspected_values(values: np.ndarray, scale: Scale) -> tuple[np.ndarray, str]:
-    """Encode values as uint8; return the bytes and the code's name. "root" and "signed" resolve values near 0 best.
+    """Encode values as uint8; return the bytes and the name of the code, which depends on the ends of the scale.
 
     ========  ==========================  ==================================================
     code      scale                       byte
     ========  ==========================  ==================================================
     root      begins at 0                 255 sqrt(v / high)
-    signed    has 0 between its ends      128 + 127 sign(v) sqrt(|v| / reach), so that 0 is 0
+    signed    has 0 between its ends      128 + 127 sign(v) sqrt(|v| / reach), so 0 stays 0
     linear    any other                   255 (v - low) / (high - low)
     ========  ==========================  ==================================================
 
-    v is a value, low and high are the ends of the scale, and ``reach`` is the larger of |low| and |high|.
+    v is a value, low and high are the ends of the scale, and ``reach`` is the larger of |low| and |high|. The codes
+    "root" and "signed" resolve values near 0 best.
     """
     low, high = scale.low, scale.high
     if low == 0:
@@ -131,7 +132,7 @@ def encode_inspected_values(values: np.ndarray, scale: Scale) -> tuple[np.ndarra
 
 
 class InspectionFrameArrays:
-    """Compressed arrays of one frame. Its layers refer to an array by its index in :attr:`arrays`."""
+    """Compressed arrays of one frame, as base64 text. The frame's layers refer to them by index in :attr:`arrays`."""
 
     def __init__(self) -> None:
         self.arrays: list[str] = []
@@ -139,7 +140,7 @@ class InspectionFrameArrays:
         self._grids: dict[tuple[int, float, float], tuple[np.ndarray, int, str]] = {}
 
     def pack_layers(self, layers: Sequence[Layer]) -> list[dict[str, Any]]:
-        """Convert valid layers to JSON values; each array becomes its index in :attr:`arrays`."""
+        """Convert valid layers to JSON values; store each array in :attr:`arrays` and replace it by its index there."""
         return [self._pack(layer) for layer in layers]
 
     def _pack(self, layer: Layer) -> dict[str, Any]:

@@ -57,7 +57,7 @@ class InspectionGrid:
 
 @dataclass(frozen=True, eq=False)
 class Volume(InspectionGrid):
-    """A volume rendering of a grid; the opacity over a length h is 1 - exp(-|value| depth h)."""
+    """A volume rendering of a grid; the opacity of a segment of length h (scene units) is 1 - exp(-|value| depth h)."""
 
     depth: float = 1.0  # optical depth of the value 1 per scene unit; frame.gain for extinction
 
@@ -82,7 +82,7 @@ class Isosurfaces(InspectionGrid):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Painted:
-    """Base class of layers with colours: values on a scale, or explicit colours, or white if both are missing."""
+    """Base class of layers with a colour per vertex, point or ellipsoid: from values on a scale, explicit, or white."""
 
     values: np.ndarray | None = None  # (N,) numbers, one per vertex, point or ellipsoid; with scale
     scale: Scale | None = None  # colours of values

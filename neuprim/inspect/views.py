@@ -89,7 +89,7 @@ DIFFERENCE = Inspector(API_VERSION, "difference", "model minus ground truth", _i
 # ---------------------------------------------------------------- viewpoints
 
 _DIRECTIONS = {"x": (-0.45, 1.0, -1.6), "y": (1.0, 0.45, 1.6), "z": (1.0, -1.6, 0.45)}
-"""Direction from the picture's centre to the camera, by the scene's upward axis."""
+"""Upward axis of the scene -> direction from the centre of the picture to the camera, of any length."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +133,11 @@ def find_inspection_viewpoint(inspector: Inspector, frame: InspectionFrame, up: 
 
 
 def unit_sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a unit sphere: (V, 3) float64 points and (F, 3) int64 triangles, counterclockwise seen from outside."""
+    """Return a mesh of the unit sphere: an icosahedron whose triangles are split into four ``subdivisions`` times.
+
+    Returns:
+        (V, 3) float64 points, and (F, 3) int64 triangles, counterclockwise seen from outside.
+    """
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions)
@@ -141,9 +145,11 @@ def unit_sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def make_inspection_ball(rings: int = 48) -> tuple[np.ndarray, np.ndarray]:
-    """Make a mesh of the unit ball without the quarter x > 0, y < 0: (P, 3) float64 points, (F, 3) int64 triangles.
+    """Make a mesh of the unit ball, cut open: without the quarter x > 0, y < 0.
 
     The sphere and the two planes of the cut share no points, so that smooth shading preserves their edges.
+
+    ``rings`` is the number of rows of points from pole to pole. Return (P, 3) float64 points, (F, 3) int64 triangles.
     """
     radius = np.linspace(0, 1, rings // 2)
     around, down = np.radians(np.linspace(0, 270, 2 * rings + 1)), np.linspace(0, np.pi, rings)

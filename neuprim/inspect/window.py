@@ -34,7 +34,10 @@ _PANEL = (720, 640)
 
 
 def list_inspection_panels(inspectors: Sequence[Inspector], with_truth: bool) -> list[Panel]:
-    """List the panels as (inspector, side). Inspectors of the extinction get a second panel for the ground truth."""
+    """List the panels of a picture as (inspector, side); side is "model" or "truth".
+
+    If ``with_truth``, inspectors of the extinction on the grid get a second panel, which shows the ground truth.
+    """
     return [
         (i, side)
         for i in inspectors
@@ -43,9 +46,12 @@ def list_inspection_panels(inspectors: Sequence[Inspector], with_truth: bool) ->
 
 
 class Window:
-    """A pyvista window with one panel per (inspector, side). Panels in scene coordinates share one camera.
+    """A pyvista window, or picture off screen, with one panel per (inspector, side).
+
+    All panels that show the whole scene share one camera.
 
     Args:
+        up: upward axis of the scene, "x", "y" or "z".
         size: size of the picture in pixels; None for 720 x 640 per panel.
     """
 
@@ -102,7 +108,10 @@ class Window:
         return np.asarray(self.plotter.screenshot(return_img=True))[..., :3]
 
     def interact(self, count: int, frame: Callable[[int], InspectionFrame]) -> None:
-        """Show the window until the user closes it. If there are several frames, a slider selects the frame."""
+        """Show the window until the user closes it. If there are several frames, a slider selects the frame.
+
+        ``frame`` returns the frame with a given index, from 0 to ``count`` - 1.
+        """
         if count > 1:
             self.add_slider(count, frame)
         self.draw(frame(0))
@@ -124,7 +133,7 @@ class Window:
         self.plotter.add_slider_widget(moved, (1, count), value=1, **ends, **look)
 
     def close(self) -> None:
-        """Free the window."""
+        """Close the window and free its resources."""
         self.plotter.close()
 
 
@@ -169,7 +178,7 @@ def _add_pyvista_box(plotter: Any, box: np.ndarray) -> None:
 
 
 def _add_pyvista_bar(plotter: Any, scale: Scale, panel: int, place: int) -> None:
-    """Draw a colour bar for ``scale``; ``place`` is its position, counted from the lowest bar."""
+    """Draw a colour bar for ``scale`` into panel number ``panel``; ``place`` counts its bars from the lowest, 0."""
     import pyvista
 
     mapper = pyvista.DataSetMapper()
@@ -219,7 +228,7 @@ def _make_pyvista_image(layer: InspectionGrid, values: np.ndarray, around: int =
 
 
 def _add_pyvista_shape(plotter: Any, layer: Any) -> None:
-    """Draw a layer of ellipsoids, a mesh or points, with one colour per vertex."""
+    """Draw a layer (ellipsoids, a mesh or points) into the plotter's current panel, with one colour per vertex."""
     import pyvista
 
     vertices = layer.vertices if isinstance(layer, Mesh) else layer.centres

@@ -1,4 +1,4 @@
-"""Call the code of plugins: check what it returns, and name its package in its errors, in one line.
+"""Call functions of plugins: check what they return, and name the plugin's package in one-line error messages.
 
 A :class:`~neuprim.core.errors.NeuprimError` passes unchanged, because its text is written for users. Any other
 exception from a plugin's code becomes a PluginError that says where the exception was raised. The original exception
@@ -61,9 +61,11 @@ class PluginSource:
 
 
 def find_plugin_source(group: PluginGroup[Any], word: str, entry: str | None = None) -> PluginSource:
-    """Return label and module of the plugin ``NAME`` or ``PACKAGE:NAME``, from package metadata, without importing it.
+    """Return label and module of a plugin for error messages, from package metadata, without importing the plugin.
 
     Args:
+        group: kind of the plugin, e.g. tasks.
+        word: ``NAME`` or ``PACKAGE:NAME`` of the plugin.
         entry: name of the entry point, if it differs from the plugin's name.
     """
     package, name = split_plugin_name(word)
@@ -82,7 +84,11 @@ def _find_plugin_info(group: PluginGroup[Any], package: str | None, entry: str) 
 
 @contextmanager
 def attribute_errors(source: PluginSource, function: str = "") -> Iterator[None]:
-    """Context manager around a call of a plugin's ``function``, e.g. ``"build"``: name the plugin in its errors."""
+    """Return a context manager for a call of a plugin's ``function``, e.g. ``"build"``.
+
+    It turns a :class:`ReturnError` and other exceptions into a PluginError that names the plugin ``source``. Other
+    NeuprimErrors, errors of the disk and exceptions of built-in plugins pass unchanged.
+    """
     where = f"{function} of {source.label}" if function else source.label
     try:
         yield
@@ -111,7 +117,7 @@ def _is_plugin_code(variables: dict[str, Any], source: PluginSource) -> bool:
 
 
 def guard_loss(loss: Loss, source: PluginSource) -> Loss:
-    """Wrap a plugin's loss function: check its results, and name the plugin in its errors."""
+    """Return a loss function that calls ``loss``, checks its results, and names the plugin ``source`` in its errors."""
     if not callable(loss):
         raise PluginError(f"{source.label}: the loss is a {type(loss).__name__}; expected a function")
 
@@ -127,7 +133,7 @@ def guard_loss(loss: Loss, source: PluginSource) -> Loss:
 
 
 class RunPlugins:
-    """The plugins that take part in a run: its task, its scene and its loss.
+    """Names and packages of the plugins of a run (task, scene and loss), for error messages.
 
     Args:
         task, scene: ``NAME`` or ``PACKAGE:NAME`` of the run's task and of its scene.
@@ -146,7 +152,11 @@ class RunPlugins:
 
     @contextmanager
     def attribute_errors(self) -> Iterator[None]:
-        """Context manager around code that calls several plugins: name the plugin whose code raised an error."""
+        """Return a context manager for code that calls several plugins of the run.
+
+        An exception from a plugin's code becomes an error that names the plugin. A NeuprimError passes unchanged,
+        except an invalid return value or data set.
+        """
         try:
             yield
         except DatasetError as error:
@@ -168,7 +178,7 @@ class RunPlugins:
 
 
 def check_returns(ok: bool, function: str, found: object, expected: str) -> None:
-    """Raise ReturnError unless ``ok``: ``function`` returned ``found`` instead of ``expected``."""
+    """Raise ReturnError unless ``ok``; message: ``function`` returned ``found``, and ``expected`` was required."""
     if not ok:
         raise ReturnError(f"{function}: found {found}; expected {expected}")
 
@@ -184,7 +194,10 @@ def check_fields(density: object, colour: object, dataset: Dataset) -> None:
 
 
 def check_loss_returns(value: Any, parts: Any, rendered: Tensor) -> None:
-    """Check the value and named parts that a loss returned (:data:`~neuprim.core.task.Loss`) for a rendered image."""
+    """Raise ReturnError if a loss (:data:`~neuprim.core.task.Loss`) returned invalid results for an image.
+
+    ``value`` must be a scalar tensor that depends on ``rendered``, the image; ``parts`` must map names to numbers.
+    """
     number = isinstance(value, Tensor) and not value.dim()
     check_returns(number, "value", _describe_returned_type(value), "one number as a tensor")
     gradient = value.requires_grad or not rendered.requires_grad
@@ -196,7 +209,7 @@ def check_loss_returns(value: Any, parts: Any, rendered: Tensor) -> None:
 
 
 def call_task_mask(task: TaskSpec, dataset: Dataset, index: int) -> Tensor | None:
-    """Return the task's mask of a test view, (H, W) bool, for metrics of masked pixels; None if there is no mask."""
+    """Return the task's (H, W) bool mask of test view ``index``, for metrics of masked pixels; None for no mask."""
     mask = task.mask(dataset, index)
     if mask is not None:
         try:
@@ -209,7 +222,10 @@ def call_task_mask(task: TaskSpec, dataset: Dataset, index: int) -> Tensor | Non
 def call_task_metrics(
     task: TaskSpec, dataset: Dataset, index: int, rendered: Tensor, truth: Tensor
 ) -> dict[str, float]:
-    """Return the task's own metrics of a test view: name -> value, finite or +inf."""
+    """Return the metrics that a task adds for test view ``index``: name -> value, finite or +inf.
+
+    ``rendered`` and ``truth`` are the (H, W, C) images of the model and of the data set.
+    """
     function = f"metrics of test view {dataset.test.view(index).name}"
     metrics = _check_returned_keys(task.metrics(dataset, index, rendered, truth), function)
     for name, value in metrics.items():
@@ -220,18 +236,18 @@ def call_task_metrics(
 
 
 def call_task_diagnose(task: TaskSpec, dataset: Dataset, model: Primitives) -> dict[str, Any]:
-    """Return the task's own diagnostics of a model for ``metrics.json``: name -> JSON-ready value."""
+    """Return the diagnostics that a task computes for a model, for ``metrics.json``: name -> JSON-ready value."""
     return _check_returned_json(task.diagnose(dataset, model), "diagnose")
 
 
 def call_task_facts(task: TaskSpec, dataset: Dataset) -> dict[str, Any]:
-    """Return facts about the data for the header of a model file: "up", "center", and those that the task adds."""
+    """Return facts about the data for the header of a model file: "up", "center", and any facts that the task adds."""
     own = {"up": [float(x) for x in dataset.up], "center": [float(x) for x in dataset.center]}
     return {**own, **_check_returned_json(task.facts(dataset), "facts")}
 
 
 def call_task_clips(task: TaskSpec, dataset: Dataset) -> list[Clip]:
-    """Return the films that the task makes from views of the data set."""
+    """Return the films that the task defines, each a sequence of views of the data set; check that the views exist."""
     clips = _check_returned_list(task.clips(dataset), "clips", Clip)
     for clip in clips:
         count = len(dataset.test if clip.source is None else clip.source)
@@ -249,7 +265,10 @@ def call_task_orbit(task: TaskSpec, dataset: Dataset, frames: int) -> list[View]
 
 
 def call_task_tunable_settings(task: TaskSpec, settings: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
-    """Return the settings that trade quality for speed or size: setting -> values worth training with."""
+    """Return the settings of the task that trade quality for speed or size: dotted key -> values worth training with.
+
+    ``settings`` are the model settings of the run, as the task's ``build`` gets them.
+    """
     found = task.tunable_settings(settings)
     expected = "a dictionary of setting names to values"
     check_returns(isinstance(found, Mapping), "tunable_settings", _describe_returned_type(found), expected)
@@ -264,8 +283,11 @@ def call_task_tunable_settings(task: TaskSpec, settings: Mapping[str, Any]) -> d
 
 
 def draw_task_layer(spec: LayerSpec, frame: LayerFrame, channels: int) -> Tensor | None:
-    """Compute a layer of one frame: finite (H, W, C) values, or None if the model lacks the layer. Layers of light have
-    ``channels`` channels, like the model's image.
+    """Compute one layer (an image such as depth, for .exr files) of a frame; check its shape and values.
+
+    Returns:
+        Finite (H, W, C) values without gradient; None if the model lacks the layer. C is the number of channels that
+        the layer names, or ``channels``, that of the model's image, if it names none (a layer of light).
     """
     values = spec.draw(frame)
     if values is None:

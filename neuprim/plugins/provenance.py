@@ -58,7 +58,10 @@ class PluginVersion:
 
     @classmethod
     def of(cls, info: PluginInfo, name: str | None = None) -> PluginVersion:
-        """Return the version of an installed plugin; ``name`` replaces the entry point's name, as for a scene."""
+        """Return package and version of an installed plugin.
+
+        ``name`` is the plugin's name if it differs from the entry point's, e.g. of a scene; None if they are equal.
+        """
         version = "".join(c for c in info.version if c.isprintable())[:_LONGEST]  # so that it can be read again
         return cls(info.name if name is None else name, info.distribution, version)
 
@@ -90,7 +93,7 @@ class Provenance:
 
     @classmethod
     def of_installed(cls, task: PluginInfo, scene: FoundScene, loss: PluginInfo | None) -> Provenance:
-        """Return the provenance of a run from its installed plugins; ``loss`` is the plugin of ``train.loss``."""
+        """Return the installed versions of neuprim and of a run's plugins; ``loss`` is the plugin of ``train.loss``."""
         added = None if scene.added_by is None else PluginVersion.of(scene.added_by, scene.spec.name)
         return cls(__version__, PluginVersion.of(task), added, None if loss is None else PluginVersion.of(loss))
 
@@ -110,7 +113,7 @@ class Provenance:
         return validate_settings(cls, value, "made_by")
 
     def origins(self) -> dict[str, str]:
-        """Return kind ("task", "scene", "loss") -> package and version as text."""
+        """Return kind ("task", "scene", "loss") -> package and version as text, and "neuprim" -> its version."""
         return {"neuprim": self.neuprim, **{kind: plugin.origin for kind, plugin in self.plugins.items()}}
 
 
@@ -148,8 +151,10 @@ def warn_of_other_provenance(made_by: Provenance, file: Path | None = None) -> N
 
 
 def check_resumed_provenance(stored: object, now: Provenance, file: Path) -> None:
-    """Raise CheckpointError if another package's task made the checkpoint than makes the run ``now``; warn if only
-    versions differ. ``stored`` is the provenance in the checkpoint.
+    """Compare the provenance ``stored`` in a checkpoint with that of the resuming run; warn if versions differ.
+
+    Raises:
+        CheckpointError: the task of the checkpoint is from another package, or ``stored`` is invalid.
     """
     try:
         before = Provenance.from_dict(stored)

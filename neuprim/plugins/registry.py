@@ -120,11 +120,14 @@ class PluginGroup(Generic[T]):
         return [info for info, _ in self._entries()]
 
     def find(self, word: str) -> PluginInfo:
-        """Return the registration of the plugin that ``word`` chooses, without importing it. Raises as :meth:`load`."""
+        """Return the registration of the plugin ``word``, ``NAME`` or ``PACKAGE:NAME``, without importing the plugin.
+
+        Raises the errors of :meth:`load`, except those of a broken plugin.
+        """
         return self._find(word)[0]
 
     def load(self, word: str) -> T:
-        """Import and check the plugin that ``word``, ``NAME`` or ``PACKAGE:NAME``, chooses; return its description.
+        """Import and check the plugin ``word``, ``NAME`` or ``PACKAGE:NAME``; return its description, e.g. a TaskSpec.
 
         Raises:
             UnknownPlugin: no installed package registers such a plugin.
@@ -139,7 +142,7 @@ class PluginGroup(Generic[T]):
         return info, self._load(info, entry)
 
     def survey(self) -> list[PluginReport[T]]:
-        """Load every registered plugin of this kind; report a broken one with its error."""
+        """Load every registered plugin of this kind; the report of a broken plugin has an error and no description."""
         reports: list[PluginReport[T]] = []
         for info, entry in self._entries():
             try:
@@ -153,13 +156,16 @@ class PluginGroup(Generic[T]):
         return self.typed.format(qualified_plugin_name(info.distribution, self.typed_name(info.name)))
 
     def shortest_name(self, info: PluginInfo) -> str:
-        """Return the plugin's bare name if that chooses this plugin, else ``PACKAGE:NAME``."""
+        """Return the bare ``NAME`` of a plugin if typing it chooses this plugin, else ``PACKAGE:NAME``."""
         name = self.typed_name(info.name)
         clash = any(other.name == info.name and other != info for other in self.list_plugins())
         return qualified_plugin_name(info.distribution, name) if clash and not info.built_in else name
 
     def warn_of_hidden(self, info: PluginInfo, by: str) -> None:
-        """Warn that the bare name of ``info`` means another plugin, and say how to choose ``info``."""
+        """Warn that the bare name of the plugin ``info`` chooses another plugin of the same name, described by ``by``.
+
+        The warning also says what to type to choose ``info``.
+        """
         what = f"{self.kind} {self.typed_name(info.name)!r} of {info.origin}"
         warn_once(f"two plugins have the same name: {by} is used, not {what}; to use it, write {self.choice(info)}")
 
@@ -192,7 +198,10 @@ class PluginGroup(Generic[T]):
         return f"{self.typed.format(word)}: no such {self.kind}{hint}"
 
     def _entries(self) -> list[tuple[PluginInfo, metadata.EntryPoint]]:
-        """List the group's entry points by name, built-in ones first."""
+        """List the entry points of this kind of plugin, with their registrations, sorted by name, built-in ones first.
+
+        If sys.path has several copies of a package, only the copy that is imported counts.
+        """
         found, packages = [], set()
         for dist in metadata.distributions():
             try:

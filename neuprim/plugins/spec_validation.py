@@ -1,4 +1,7 @@
-"""Check a plugin's description when it is loaded, so that a wrong description does not fail in the middle of a run."""
+"""Check a plugin's description, e.g. a TaskSpec, when the plugin is loaded.
+
+Without this check, a wrong description would fail only in the middle of a run.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ from neuprim.core.validation import option_type_to_validate, validate_value
 
 _NESTED: dict[str, type] = {kind.__name__: kind for kind in (SceneSpec, ConditionSpec, LayerSpec)}
 _FUNCTIONS = ("Callable", "Display", "Illuminate")
-"""Prefixes of the annotations of members that are functions."""
+"""Beginnings of the type annotations of members that must be functions."""
 
 
 class _InvalidMember(Exception):
@@ -40,7 +43,11 @@ def _require_member(ok: bool, text: str) -> None:
 
 
 def _check_spec(spec: Any) -> None:
-    """Check every member of a description against its type annotation, and then against the rules of its class."""
+    """Check every member of a plugin's description (a dataclass) against its annotation and the rules of its class.
+
+    Raises:
+        _InvalidMember: a member is invalid.
+    """
     for member in fields(spec):
         name, annotation, value = member.name, str(member.type), getattr(spec, member.name)
         kind, optional = annotation.removesuffix(" | None"), annotation.endswith("| None")

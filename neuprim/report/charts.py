@@ -31,15 +31,17 @@ _VARIABLES = {INK: "var(--muted)", GRID: "var(--line)", TRAINING: "var(--trainin
 _PNG_COLOURS = {INK: "#5d6670", GRID: "#e2e4e3", TRAINING: "#6884a6", HELD_OUT: "#c9551c"}
 
 SMALL, LARGE = (360, 210), (540, 300)
-"""Sizes of a chart in points. Panels are about as wide in CSS pixels, so text keeps its size."""
+"""(width, height) of charts in points. Panels are about as wide in CSS pixels, so text keeps its size."""
 
 _BUCKETS = 120
-"""Groups of points in a band, each drawn as its median and range. Up to twice as many points are drawn singly."""
+"""Number of groups into which the points of a long line are divided. Each group is drawn as its median and range. A
+line of at most twice as many points is drawn without groups."""
 
 _FEW = 40  # points of a line up to which each is marked
 
 _LOG_RATIO, _FRONT_LOG_RATIO = 4.0, 1.5
-"""An axis is logarithmic if its positive values, or the costs of a front, span at least this factor."""
+"""Least ratio of largest to smallest value for a logarithmic axis: the y axis of a positive curve, and the x axis of a
+chart of quality against cost."""
 
 _LEAST_DECIBELS = 0.4  # least range of the y axis of a front: smaller differences are invisible
 
@@ -50,7 +52,7 @@ class ChartPoints:
 
     Attributes:
         joined: connect the points by a line; markers are only drawn if there are few points.
-        band: draw many points as a line of their median with a band of their range.
+        band: draw many points as a line of medians, with a band from minimum to maximum, over groups of points.
         spread: half-lengths of horizontal error bars; no bars if empty.
         labels: texts below the points.
         name: text in the chart's legend.
@@ -82,7 +84,7 @@ class Chart:
         title: text for screen readers, and the heading above a PNG.
         ring: (x, y) of a point that is highlighted by a ring.
         log_x, log_y: whether the axis is logarithmic.
-        least: lower limit on the length of the y axis, in its unit.
+        least: smallest difference between top and bottom of the y axis.
     """
 
     title: str
@@ -107,7 +109,7 @@ class Dot(NamedTuple):
         cost, spread: cost, drawn along x, and the half-length of its error bar.
         good: quality, drawn along y.
         mark: text beside a point on the Pareto front; None for a point that is not on the front.
-        reference: whether other points are compared with this one, which gets a ring.
+        reference: whether other points are compared with this point. It is highlighted by a ring.
     """
 
     cost: float
@@ -271,7 +273,10 @@ def _style() -> AbstractContextManager[None]:
 
 
 def _chart_to_svg_element(figure: Figure, label: str) -> str:
-    """Return a figure as an ``<svg>`` element: no outside addresses or global styles, unique ids, the page's font."""
+    """Return a matplotlib figure as an ``<svg>`` element for a page. ``label`` is its text for screen readers.
+
+    The element has the page's font, no outside addresses, no global styles, and ids that are unique for each label.
+    """
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", transparent=True)
     body = buffer.getvalue()

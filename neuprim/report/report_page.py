@@ -1,6 +1,6 @@
 """The template of all report pages, the HTML elements in them, and functions that format values.
 
-Every page is one file: pictures and charts are embedded, and its content policy forbids loading anything else.
+Every page is one file: pictures and charts are embedded, and its content security policy forbids loading anything else.
 Every function escapes its text arguments, unless its docstring says that they are HTML.
 """
 
@@ -105,7 +105,7 @@ def figure(source: Path | Tensor, caption: str, alternative: str, attributes: st
 
 
 def chart_panels(charts: Iterable[tuple[str, Chart]], kind: str = "panels") -> str:
-    """Return (caption, chart) pairs as HTML of CSS class ``kind``. Captions are HTML; empty charts are left out."""
+    """Return HTML of CSS class ``kind`` with (caption, chart) pairs. Captions are HTML; empty charts are left out."""
     panels = [
         f'<figure class="panel"><figcaption>{caption}</figcaption>{drawn}</figure>'
         for caption, chart in charts
@@ -143,7 +143,7 @@ def fact_list(pairs: Iterable[tuple[str, object]]) -> str:
 
 
 def escape(value: object) -> str:
-    """Return ``value`` as HTML text that is also safe inside a quoted attribute."""
+    """Return ``value`` as HTML text that is also safe inside a quoted attribute; a dash if it is None or empty."""
     return MISSING if value is None or value == "" else html.escape(format_report_setting(value), quote=True)
 
 

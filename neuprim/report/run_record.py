@@ -48,7 +48,7 @@ class ReportedRun:
 
     @property
     def view_numbers(self) -> list[Mapping[str, Any]]:
-        """Metrics of each held-out view."""
+        """Metrics of each held-out view, from ``per_view`` in ``metrics.json``."""
         entries = self.metrics.get("per_view")
         return [e for e in entries if isinstance(e, Mapping)] if isinstance(entries, list) else []
 
@@ -113,7 +113,10 @@ def _parse_reported_line(text: str) -> Mapping[str, Any] | None:
 
 
 def _find_reported_views(folder: Path) -> list[ViewFiles]:
-    """Return the views that have all pictures: those with an error map, which is the last picture to be written."""
+    """Return the picture files of the held-out views in ``folder``, in order of the views.
+
+    Views without an error map are left out, because that picture is written last.
+    """
     views = []
     for error in folder.glob("test_*_error.png"):
         name = error.stem.removesuffix("_error")

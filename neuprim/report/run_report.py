@@ -33,7 +33,7 @@ VIEWER_LIMIT = 4_000_000  # bytes of a report with a viewer in it; the viewer of
 _WORST_SHOWN = 6  # worst regions that are shown unfolded
 
 _SOURCES = {"generated": "generated data: not photographs", "simulated": "simulated data: not captured"}
-"""Data source -> badge; real data has none."""
+"""Data source -> text of the badge in the report's head; real data has no badge."""
 
 _VIEWER_FILE = "viewer.html"
 
@@ -136,7 +136,7 @@ def _report_warnings(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def _report_headline(metrics: Mapping[str, Any]) -> str:
-    """Return tiles with quality, size and training time, as far as they were measured."""
+    """Return HTML tiles (large numbers) with quality, size and training time, as far as they were measured."""
     psnr, worst = (metric_from_json(metrics, key) for key in ("psnr", "psnr_worst"))
     tiles: list[Tile] = []
     if psnr is not None:
@@ -179,7 +179,7 @@ def _report_comparison(run: ReportedRun) -> str:
 
 
 def _view_button(index: int, text: str) -> str:
-    """Return a button that opens a view's pictures in the comparison; ``run.js`` makes it visible."""
+    """Return an HTML button that shows a view's pictures in the comparison; ``run.js`` makes the button visible."""
     return f'<button type="button" data-view="view-{index}" hidden>{text}</button>'
 
 
@@ -223,7 +223,7 @@ def _report_view(run: ReportedRun, view: ViewFiles) -> str:
 
 
 def _report_worst_regions(regions: Sequence[tuple[Region, Path]]) -> str:
-    """Return a section with the worst region of the held-out views, worst first; all after the sixth are folded."""
+    """Return a section with pictures of the worst regions, worst first; all after the sixth are collapsed."""
     figures = []
     for region, path in regions:
         name, place = escape(region.view), f"{region.side}×{region.side} at ({region.x}, {region.y})"
@@ -294,7 +294,7 @@ def _report_details(run: ReportedRun) -> str:
 
 
 def _report_measurements(metrics: Mapping[str, Any]) -> list[tuple[str, object]]:
-    """Return (name, value) of the measurements that the tiles do not show."""
+    """Return (name, value as text) of the measurements that the large tiles at the top do not show."""
     rows: list[tuple[str, str, int, str]] = [
         ("PSNR of sRGB images", "psnr_srgb", 2, "dB"),
         ("PSNR of displayed images", "psnr_display", 2, "dB"),

@@ -172,7 +172,7 @@ def _charts(runs: Sequence[SweepPageRun], colours: Mapping[str, str]) -> str:
 
 
 def _views_side_by_side(runs: Sequence[SweepPageRun]) -> str:
-    """Return a section with a few held-out views, evenly spread, of the first runs in ``runs``, which are the best."""
+    """Return HTML with a few evenly spread held-out views of the first runs in ``runs``, which is sorted best first."""
     pictured = [run for run in runs if run.run.views]
     if not pictured:
         return ""

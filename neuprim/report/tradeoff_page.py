@@ -24,7 +24,12 @@ Command = Callable[[Sequence[str]], str]
 
 
 class TradeoffPicture(NamedTuple):
-    """Displayed image of a trade-off's point, (H, W, 3) sRGB, and the image that the page compares it with, or None."""
+    """Picture of one point of a trade-off, that is of one render configuration or trained model.
+
+    Attributes:
+        image: the displayed image, (H, W, 3) sRGB.
+        against: the image that the page compares ``image`` with, or None.
+    """
 
     image: Tensor
     against: Tensor | None
@@ -119,7 +124,7 @@ class _TradeoffPage:
         return section("Fronts", panels + report_note(text))
 
     def cards(self, front: str, title: str, text: str) -> str:
-        """Return a card for every point of a front, with picture, metrics and command, as HTML."""
+        """Return HTML with a card (picture, metrics, command) for every point of a Pareto front, "speed" or "size"."""
         cards = [self._card(-1, "ground truth", "")] if -1 in self.pictures else []
         if 0 not in self.front[front]:
             cards.append(self._card(0, escape(self.points[0]["name"]), self.reference))

@@ -1,1 +1,1 @@
-"""Single runs: train, evaluate, render, export and inspect them. Nothing here parses arguments or prints."""
+"""Train, evaluate, render, export and inspect runs (models in directories). Nothing here parses arguments or prints."""

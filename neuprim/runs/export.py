@@ -1,4 +1,4 @@
-"""Export the model of a run directory to another format, and import it back."""
+"""Export the model of a run directory to another format, and import an exported file as a run directory."""
 
 from __future__ import annotations
 
@@ -71,7 +71,10 @@ def export_run(
 
 
 def _run_export_destination(run_dir: Path, exporter: Exporter, out: Path | None) -> Path:
-    """Return the path to write: ``out``, or ``export/`` in the run directory with the exporter's own name."""
+    """Return the path to write: ``out``, or a path in ``RUN_DIR/export`` with the exporter's default file name.
+
+    Raises ConfigError if the suffix of ``out`` does not fit the exporter.
+    """
     if out is None:
         return run_dir / "export" / (exporter.default or exporter.name + "".join(exporter.suffixes[:1]))
     fits = any(out.name.lower().endswith(suffix) and len(out.name) > len(suffix) for suffix in exporter.suffixes)
@@ -81,7 +84,10 @@ def _run_export_destination(run_dir: Path, exporter: Exporter, out: Path | None)
 
 
 def _check_run_export_files(report: Any, output: StagedOutput, exporter: str) -> tuple[Path, ...]:
-    """Return the final paths of the files that an exporter reported. Raises PluginError if the report is wrong."""
+    """Check the files that an exporter reports, which are still in a temporary folder; return their final paths.
+
+    Raises PluginError if the report is wrong, or if a file is missing or outside of the output path.
+    """
     if not isinstance(report, ExportReport):
         raise PluginError(f"{exporter}: write returned {type(report).__name__}; expected an ExportReport")
     files = []
@@ -101,7 +107,10 @@ def _check_run_export_files(report: Any, output: StagedOutput, exporter: str) ->
 def _parse_run_export_options(
     words: Sequence[str], exporter: Exporter, specs: Sequence[ConditionSpec]
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Split the command's words into the exporter's options, completed with defaults, and the texts of conditions."""
+    """Parse the last arguments of ``neuprim export``, such as ``KEY=VALUE`` and ``--time 0.5``.
+
+    Returns the exporter's options, completed with defaults, and condition name -> text, e.g. ``{"time": "0.5"}``.
+    """
     options = {name: default for name, (default, _) in exporter.options.items()}
     conditions, rest = split_conditions(words, specs)
     if conditions and not exporter.conditions:
@@ -123,7 +132,7 @@ def _parse_run_export_options(
 
 
 def _parse_run_export_option(text: str) -> Any:
-    """Parse a number, true, false, null, or text. Unlike in YAML, 1e-3 is a number and 1:40 is text."""
+    """Parse a value: a number, true, false, null or text. Unlike in YAML, 1e-3 is a number and 1:40 is text."""
     words = {"true": True, "false": False, "null": None, "": None}
     if text in words:
         return words[text]
@@ -174,7 +183,10 @@ def import_run_directory(path: Path, out: Path, name: str | None = None) -> Path
 
 
 def import_model_as_run(stored: StoredModel, path: Path, out: Path) -> Path:
-    """Write a stored model as the run directory ``out``. The result is loaded once before it becomes ``out``."""
+    """Write a model that was read from the exported file ``path`` as the run directory ``out``; return ``out``.
+
+    The directory has a temporary name until it has been loaded once as a check.
+    """
     header: Mapping[str, Any] = {key: value for key, value in stored.header.items() if key not in ("format", "kind")}
     tensors = {name: torch.from_numpy(value) for name, value in stored.tensors.items()}
 
@@ -185,7 +197,13 @@ def import_model_as_run(stored: StoredModel, path: Path, out: Path) -> Path:
 
 
 def _write_imported_run(path: Path, out: Path, config: str, write: Callable[[Path], object]) -> Path:
-    """Create and validate a run directory with the text of ``config.yaml``; ``write`` writes the model's file."""
+    """Create the run directory ``out`` and check that it can be loaded; return ``out``.
+
+    Args:
+        path: the imported file, which errors name.
+        config: text of ``config.yaml``.
+        write: function (folder) that writes the model's file.
+    """
     out.parent.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
     try:

@@ -93,14 +93,14 @@ Events = Callable[[Event], None]
 
 
 def ignore_run_event(event: Event) -> None:
-    """Ignore an event: the default listener of a training."""
+    """Do nothing: the default function that receives the events of a training."""
 
 
 # ---------------------------------------------------------------- fit
 
 
 TrainerFactory = Callable[[Job, Dataset, Loss], Trainer]
-"""Function (job, its data set, its loss) -> trainer of an existing model."""
+"""Function (job, its data set, its loss) -> trainer that continues an existing model, not an untrained one."""
 
 
 @dataclass(frozen=True)
@@ -120,16 +120,16 @@ class Fitted(Job):
 
     @property
     def training(self) -> dict[str, Any]:
-        """Number of steps and seconds of training, as in ``metrics.json``."""
+        """Entries ``iterations`` (training steps) and ``train_seconds`` of ``metrics.json``."""
         return {"iterations": self.trainer.step, "train_seconds": self.trainer.elapsed}
 
     def unlock_bands(self) -> None:
-        """Make the fields use all bands of spherical harmonics, as at the end of the budget."""
+        """Make the density and colour use all bands of spherical harmonics; training activates the bands gradually."""
         for field in (self.model.density, self.model.colour):
             field.set_progress(1.0)
 
     def metrics(self) -> dict[str, Any]:
-        """Measure the held-out views; return the content of ``metrics.json``."""
+        """Measure the held-out views; return quality, size and speed, the content of ``metrics.json``."""
         self.unlock_bands()
         views = measure_views(self.model, self.task, self.dataset, self.config.renderer, self.lpips)
         size = 4 * sum(value.numel() for value in self.model.params.values())
@@ -137,7 +137,7 @@ class Fitted(Job):
 
 
 def fit(config: RunConfig, events: Events = ignore_run_event, dataset: Dataset | None = None) -> Fitted:
-    """Train a configuration to the end of its budget, in memory, without files.
+    """Train a configuration to the end of its budget (steps or seconds), in memory, without files.
 
     Args:
         config: the configuration.
@@ -152,7 +152,7 @@ def fit(config: RunConfig, events: Events = ignore_run_event, dataset: Dataset |
 
 
 def train_to_end(fitted: Fitted, events: Events = ignore_run_event) -> Fitted:
-    """Train to the end of the budget; return ``fitted``."""
+    """Compile the kernels, and train to the end of the budget (steps or seconds); return ``fitted``."""
     compile_run_kernels(fitted.trainer, events)
     with use_one_torch_thread_for_run():
         for _ in train_run_steps(fitted.trainer, events):
@@ -172,9 +172,10 @@ def prepare_training(
     """Load the data and create loss, model and trainer, without training. Raises the errors of :func:`fit`.
 
     Args:
-        hold_out: n > 1 holds out every n-th training view in place of the test views; 0 uses the splits unchanged.
+        hold_out: n > 1 holds out one of every n training views and measures them instead of the test views; 0 uses
+            the splits unchanged.
         make: function that makes the trainer; None for :func:`make_run_trainer`, which creates an untrained model.
-        group: the ranks that train the model together; None for one process.
+        group: the ranks (processes) that train the model together; None for one process.
     """
     if make is None:
         refuse_chunks(config, "this function trains one model; only a whole run can train in chunks")
@@ -239,13 +240,16 @@ def train_run_steps(trainer: Trainer, events: Events = ignore_run_event) -> Iter
 
 
 def _next_run_curve_progress(trainer: Trainer) -> float:
-    """Return the progress, 0..1, at which held-out views are measured next; infinity if ``eval_every`` is 0."""
+    """Return the progress (used fraction of the budget) at which held-out views are measured next.
+
+    Return infinity if ``train.eval_every`` is 0.
+    """
     every = trainer.settings.eval_every
     return (int(trainer.progress / every + 1e-9) + 1) * every if every > 0 else float("inf")
 
 
 def measure_run_curve_point(trainer: Trainer) -> float:
-    """Return the mean PSNR of a few held-out views, each clamped to 200 dB, without changing the training state."""
+    """Return the mean PSNR of up to five held-out views, each clamped to 200 dB. The training state does not change."""
     views, background = trainer.dataset.test, trainer.dataset.background
     chosen = sorted({i * len(views) // _CURVE_VIEWS for i in range(_CURVE_VIEWS)})
     total = 0.0
@@ -261,7 +265,7 @@ def measure_run_curve_point(trainer: Trainer) -> float:
 
 
 def make_run_loss(job: Job) -> Loss:
-    """Make the loss of a job: its task's own, or the one that ``train.loss`` names.
+    """Return the loss function of a job: the one that ``train.loss`` names, or the task's own if none is named.
 
     Raises:
         ConfigError: the loss does not exist, or refuses an option.
@@ -279,7 +283,7 @@ def make_run_trainer(job: Job, dataset: Dataset, loss: Loss, group: ProcessGroup
     """Make an untrained model for a job, and return a trainer for it.
 
     Args:
-        group: the ranks that train the model together; None for one process.
+        group: the ranks (processes) that train the model together; None for one process.
 
     Raises:
         ConfigError: a learning rate or initial value is set for a parameter that the model does not have.
@@ -321,7 +325,10 @@ def _starting_count_of_run(config: RunConfig) -> int:
 
 
 def _choose_run_size(job: Job, dataset: Dataset, loss: Loss, events: Events) -> int:
-    """Measure in a short training how many primitives ``train.max_seconds`` allows, for ``model.primitives=auto``."""
+    """Return the number of primitives for ``model.primitives=auto``.
+
+    The number depends on ``train.max_seconds`` and on the time per step, which a short trial training measures.
+    """
     config = job.config
     whole = replace(config.train, population=replace(config.train.population, grow_from=1.0))
     trial = replace(config, model=replace(config.model, primitives=_TRIAL_PRIMITIVES), train=whole)
@@ -341,7 +348,10 @@ def _choose_run_size(job: Job, dataset: Dataset, loss: Loss, events: Events) -> 
 
 
 def compile_run_kernels(trainer: Trainer, events: Events = ignore_run_event) -> None:
-    """Compile the kernels before the training clock starts, by one step on a temporary copy of a few primitives."""
+    """Compile the kernels before the training clock starts.
+
+    The function performs one training step on a temporary copy of a few of the model's primitives.
+    """
     events(Preparing("loading kernels; once per installation they are compiled, which takes about a minute"))
     model = trainer.model
     rows = torch.arange(0, model.count, max(model.count // 64, 1))  # some of them are active in the view
@@ -355,7 +365,10 @@ def compile_run_kernels(trainer: Trainer, events: Events = ignore_run_event) -> 
 
 @contextmanager
 def use_one_torch_thread_for_run() -> Iterator[None]:
-    """Limit PyTorch to one thread: its tensors are small, and its threads would take cores from the kernels."""
+    """Context manager that limits PyTorch to one thread.
+
+    PyTorch's tensors are small here, and PyTorch's threads would take cores from the compiled kernels.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -365,11 +378,14 @@ def use_one_torch_thread_for_run() -> Iterator[None]:
 
 
 def is_chunked(config: RunConfig) -> bool:
-    """Return whether the scene is trained in chunks. In some scenes, the setting ``chunks`` means something else."""
+    """Return whether the scene is trained in chunks (parts that are trained as separate runs).
+
+    The setting ``scene.chunks`` alone does not decide this, because it has another meaning in some scenes.
+    """
     return config.scene.get("chunks") not in (None, 1) and Job.of(config).scene.spec.chunks is not None
 
 
 def refuse_chunks(config: RunConfig, reason: str) -> None:
-    """Raise ConfigError if the configuration trains in chunks; ``reason`` says why the caller cannot do it."""
+    """Raise ConfigError if the configuration trains the scene in chunks; ``reason`` says why the caller cannot."""
     if is_chunked(config):
         raise ConfigError(f"scene.chunks={config.scene['chunks']}: {reason}; expected scene.chunks=null")

@@ -24,7 +24,7 @@ _MOST_FRAMES = 16
 """Largest number of frames in one job."""
 
 _loaded: dict[str, DatasetImages] = {}
-"""Scene key -> ground truth of this process's last job, because all jobs of a launch have the same scene."""
+"""Cache of one entry: scene key -> ground truth of this process's last job. All jobs of a launch have one scene."""
 
 
 def load_run_ground_truth(
@@ -110,8 +110,11 @@ def render_ground_truth_before_run(config: RunConfig, settings: LauncherSettings
 
 
 def split_frames_into_jobs(missing: Sequence[int], workers: int) -> Iterator[list[int]]:
-    """Yield a list of frames for each job: several frames at first, single frames at the end, so that a slow worker
-    delays the end little (guided self-scheduling; Polychronopoulos and Kuck, 1987)."""
+    """Yield a list of ``missing`` frames for each job, to be rendered by ``workers`` parallel workers.
+
+    The first jobs have several frames and the last jobs have one, so that a slow worker delays the end little (guided
+    self-scheduling; Polychronopoulos and Kuck, 1987).
+    """
     left = list(missing)
     while left:
         count = min(max(len(left) // (4 * workers), 1), _MOST_FRAMES)
@@ -120,7 +123,10 @@ def split_frames_into_jobs(missing: Sequence[int], workers: int) -> Iterator[lis
 
 
 def render_frames_job(data: Mapping[str, Any], attempt: int, events: Events) -> int:
-    """Render a job's ground-truth frames in a worker; return the number of frames."""
+    """Render the ground-truth images of some frames in a worker process; return the number of frames.
+
+    ``data`` has the run's configuration, the indices of the frames, and values that the launcher has computed.
+    """
     config = RunConfig.from_dict(data["config"])
     key = _run_scene_key(config)
     if key not in _loaded:

@@ -53,8 +53,9 @@ class InspectRequest:
 
     Attributes:
         conditions: name -> text, e.g. ``{"time": "0:1"}``.
-        grid: number of points along the longest side of the box.
-        box: (2, 3) box in the coordinates of the run's data; None for the ground truth's, or the model's extent.
+        grid: number of points at which the density is sampled along the longest side of the box.
+        box: (2, 3) box in the coordinates of the run's data; None for the box of the ground truth, or of the model if
+            there is no ground truth.
         levels: extinctions at which to draw isosurfaces, 1/scene unit.
         against: ground truth to compare with: an OpenVDB file or folder, or "scene".
         up: upward axis, "x", "y" or "z"; None for the scene's setting, or z.
@@ -120,7 +121,10 @@ def inspect_run(request: InspectRequest, events: Events = ignore_run_event) -> l
 
 
 def _load_run_inspector(name: str) -> Inspector:
-    """Load an inspector by name. Errors in a plugin's inspector name its package, and its layers are checked."""
+    """Load an inspector, which makes the layers to draw, by name.
+
+    An inspector of a plugin is wrapped: its errors name the plugin's package, and its layers are checked.
+    """
     inspector, source = INSPECTORS.load(name), find_plugin_source(INSPECTORS, name)
     if source.built_in:
         return inspector
@@ -167,7 +171,7 @@ def _write_run_frames(out: Path, film: _RunFrames, write: Callable[[Path, Inspec
 
 
 class _RunFrames:
-    """The frames that an inspection shows, computed one at a time, with one box and one scale for all frames."""
+    """The frames that an inspection shows, computed one at a time, with one box and one colour scale for all frames."""
 
     def __init__(self, request: InspectRequest, events: Events) -> None:
         run = open_run(request.run)
@@ -217,7 +221,11 @@ class _RunFrames:
         return numbers
 
     def _find_scale(self, box: np.ndarray) -> tuple[float, float, tuple[float, ...]]:
-        """Return the top of the extinction scale, a factor on the opacity of volumes, and the extinction's centroid."""
+        """Return (top, gain, focus) for all frames, from a coarse grid in the box.
+
+        ``top`` is the end of the extinction's colour scale, 1/scene unit, and ``gain`` a factor on the opacity of drawn
+        volumes. ``focus`` is the centroid (x, y, z) of the ground truth's or the model's extinction, scene units.
+        """
         matrix, shape = box_lattice(box, _SCALE_POINTS)
         most, depth, total = 0.0, 0.0, np.zeros(shape)
         for conditions, number in self.pairs:
@@ -259,7 +267,7 @@ class _RunFrames:
 
 
 def _round_scale_of_run_frames(value: float) -> float:
-    """Round ``value`` up to two significant digits, for the end of a colour scale; return 1 for 0."""
+    """Round ``value`` up to two significant digits, for the end of a colour scale; return 1 unless it is positive."""
     if not value > 0:
         return 1.0
     unit = 10.0 ** (math.floor(math.log10(value)) - 1)

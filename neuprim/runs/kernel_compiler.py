@@ -1,7 +1,7 @@
-"""Compile the kernels of a run in a second process, while the first one makes or reads the images.
+"""Compile the CPU kernels of a run in a second process, while the first process generates or reads the images.
 
 Compiling takes about a minute on one core, once per installation and task. The second process trains a few primitives
-on noise for one step; the compiled code reaches the first one through the cache of kernels.
+on noise images for one step. The first process then reads the compiled code from the kernel cache on disk.
 """
 
 from __future__ import annotations
@@ -32,7 +32,10 @@ _SIZE, _PRIMITIVES, _POINTS = 32, 64, 64  # of the noise: pixels a side, primiti
 
 
 class KernelCompiler:
-    """Second process that compiles the kernels of a run. It starts only if no run of the task has compiled them yet.
+    """Second process that compiles the CPU kernels of a run while the first process loads the data.
+
+    The process does not start if a run of the task has compiled the kernels before, if the task is not built in, if
+    there is only one core, or if torch finds a CUDA device.
 
     Args:
         config: configuration of the run.
@@ -53,18 +56,21 @@ class KernelCompiler:
             pipe.write(json.dumps(config.to_dict()).encode())
 
     def wait(self, events: Events) -> None:
-        """Wait until the second process has ended; otherwise this process would compile the same kernels."""
+        """Wait until the compiling process has ended; otherwise this process would compile the same kernels again."""
         if self._process is not None and self._process.poll() is None:
             events(Preparing("compiling kernels; once per installation this takes about a minute"))
             self._process.wait()
 
     def finish(self) -> None:
-        """Note that kernels of this task are compiled."""
+        """Create the marker file that says that the kernels of this task are compiled."""
         self._marker.touch()
 
 
 def _marker(task: str) -> Path:
-    """Return the file that says that these sources were compiled for a task; most kernels serve all its models."""
+    """Return the path of a marker file, which exists if the kernels of this version were compiled for ``task``.
+
+    There is one marker for all models of a task, because most kernels serve all of them.
+    """
     return cache_directory() / f"compiled-{sources_hash(Path(backend.__file__))}-{task}"
 
 
@@ -72,7 +78,7 @@ def _marker(task: str) -> Path:
 
 
 class _NoiseViews(ViewSet):
-    """Two views, 3 units from the origin, whose images are noise."""
+    """Two views for compiling kernels. Their images are noise, and their cameras are about 3 units from the origin."""
 
     def __init__(self, channels: int, conditions: dict[str, torch.Tensor]) -> None:
         eyes = [torch.tensor([3.0, 0.0, 0.5]), torch.tensor([0.0, 3.0, 0.5])]
@@ -93,7 +99,7 @@ class _NoiseViews(ViewSet):
 
 
 class _NoisePoints(PointSupervision):
-    """Points with random extinction."""
+    """Source of random points with random extinction and source radiance, for compiling kernels."""
 
     def __init__(self, channels: int, conditions: dict[str, torch.Tensor]) -> None:
         self._channels, self._conditions = channels, conditions
@@ -105,7 +111,10 @@ class _NoisePoints(PointSupervision):
 
 
 def _noise_dataset(conditions: list[ConditionSpec], channels: int, voxels: bool) -> Dataset:
-    """Return a data set of noise images, and of points if ``voxels``; conditions are in the middle of their ranges."""
+    """Return a data set for compiling kernels: noise images, and random points with extinction if ``voxels``.
+
+    The value of each condition (e.g. the time) is the middle of the condition's range.
+    """
     values = {spec.name: torch.full(spec.shape, 0.5 * sum(spec.range), dtype=torch.float64) for spec in conditions}
     views = _NoiseViews(channels, values)
 

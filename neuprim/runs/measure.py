@@ -1,11 +1,11 @@
 """Measure a model: metrics of every held-out view, their means, and further metrics of the task.
 
-PSNR and SSIM compare float images in the data set's own colour space, unclamped and unquantised. A linear data set of
-red, green and blue also gets both after the sRGB transfer curve (``psnr_srgb``, ``ssim_srgb``). A task that converts
-its channels to a displayed image itself gets both of the displayed image (``psnr_display``, ``ssim_display``). If the
-task masks a part of a view, the error inside the mask is also reported alone, because a black background improves the
-mean. ``ssim_3dgs`` is the SSIM of the displayed image as 3D Gaussian splatting computes it. ``lpips`` is LPIPS as
-published; ``lpips_3dgs`` is LPIPS as 3D Gaussian splatting computes it.
+PSNR and SSIM compare float images in the data set's own colour space, unclamped and unquantised. For linear RGB images
+both are also computed after the sRGB transfer curve (``psnr_srgb``, ``ssim_srgb``). If the task has its own conversion
+of channels to a displayed image, both are also computed for the displayed image (``psnr_display``, ``ssim_display``).
+If the task masks a part of a view, the error inside the mask is also reported alone, because a black background
+improves the mean. ``ssim_3dgs`` is the SSIM of the displayed image as 3D Gaussian splatting computes it. ``lpips`` is
+LPIPS as published; ``lpips_3dgs`` is LPIPS as 3D Gaussian splatting computes it.
 """
 
 from __future__ import annotations
@@ -45,8 +45,9 @@ from neuprim.version import __version__
 __all__ = ["ViewMetrics", "evaluate_run", "measure_views", "render_image"]
 
 _VISIBLE_PSNR = 20 * math.log10(255)
-"""PSNR of an error of one level of 255, dB: smaller errors are invisible. The bound matters for empty frames, whose
-black image has no error."""
+"""PSNR of an error of one level of 255 in all pixels, dB; smaller errors are invisible. Only views with a lower PSNR
+count as worse than a black image. Without this bound, invisible errors in empty frames would count, because a black
+image of an empty frame has no error."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,10 @@ def mask_rendering(rendered: Tensor, pixels: Pixels, background: Tensor) -> tupl
 def _measure_view(
     rendered: Tensor, seconds: float, task: TaskSpec, dataset: Dataset, index: int, lpips: Lpips | None
 ) -> tuple[ViewMetrics, Tensor, Tensor]:
-    """Return metrics of a test view, and its rendering and ground truth as :func:`mask_rendering` does."""
+    """Return the metrics of test view ``index``, and its rendering and ground truth from :func:`mask_rendering`.
+
+    ``seconds`` is the time in which ``rendered`` was rendered.
+    """
     view, pixels, background = dataset.test.view(index), dataset.test.pixels(index), dataset.background
     channels = find_channels(task, dataset)
     check_pixels("test", view, pixels, dataset.channels)
@@ -198,7 +202,7 @@ def _mask_metrics(rendered: Tensor, truth: Tensor, dataset: Dataset, mask: Tenso
 
 
 def _table_metrics(rendered: Tensor, truth: Tensor, channels: Channels, lpips: Lpips | None) -> dict[str, float]:
-    """Return SSIM and LPIPS of the displayed image, computed by the conventions of published tables."""
+    """Return SSIM and, with a network, LPIPS of the displayed image, computed as in published tables of results."""
     a, b = (channels.display(x).clamp(0.0, 1.0) for x in (rendered, truth))
     found = {"ssim_3dgs": ssim_3dgs(a, b)}
     if lpips is not None and min(a.shape[:2]) >= lpips.least:
@@ -246,7 +250,7 @@ def summarize_run_metrics(
 
     Args:
         training: entries ``iterations`` and ``train_seconds``, as the run recorded them.
-        split: name of the measured views; means per frame of the task's clips are only computed for "test".
+        split: name of the measured views; means per frame of the task's clips (films) are only computed for "test".
     """
     config, task, channels = job.config, job.task, find_channels(job.task, dataset)
     worst, first = min(views, key=lambda v: v.psnr), dataset.test.view(0)
@@ -317,7 +321,10 @@ def _run_lpips_entries(views: Sequence[ViewMetrics], lpips: Lpips | None) -> dic
 
 
 def _run_frame_means(clips: Sequence[Clip], views: Sequence[ViewMetrics]) -> dict[str, Any]:
-    """Return the mean of each metric at each frame over all clips of test views; {} if the clips differ in length."""
+    """Return ``{"per_frame": [...]}``: at each frame, the mean PSNR and SSIM over all clips (films) of test views.
+
+    Return {} if there are no such clips, or if they differ in length.
+    """
     own = [[views[i] for i in clip.views] for clip in clips if clip.source is None]
     if not own or len({len(clip) for clip in own}) != 1:
         return {}

@@ -1,6 +1,6 @@
-"""Run directories: lock one, load a finished run from one, and list the result files of a run.
+"""Lock a run directory, load a finished run from its directory, and list its result files.
 
-The lock keeps other processes out. Configuration, task, model, data and metrics are read from disk only.
+The lock keeps other processes from using the directory. Nothing here trains or changes a model.
 """
 
 from __future__ import annotations
@@ -57,12 +57,15 @@ Progress = Callable[[str, float], None]
 
 
 def ignore_progress(text: str, fraction: float) -> None:
-    """Ignore progress: the default of functions that report (text, fraction)."""
+    """Do nothing: the default of ``progress`` arguments, functions that are called with (text, fraction 0..1)."""
 
 
 @dataclass(frozen=True)
 class StoredRun(Job):
-    """A finished run, loaded from its directory. ``task`` reads positions in the coordinates of the data's files."""
+    """A finished run, loaded from its directory.
+
+    ``task`` reads positions that users type (e.g. of a light) in the coordinates of the data's files.
+    """
 
     directory: Path
     model: Primitives
@@ -114,7 +117,7 @@ def load_run(run: Path | StoredRun, named: bool = True) -> StoredRun:
 
 
 def make_run_scene_context(config: RunConfig, progress: Progress) -> SceneContext:
-    """Return the context of a run's scene loader: seed, cache directory and progress function.
+    """Return what a run's scene loader needs besides its settings: seed, cache directory and progress function.
 
     Raises:
         ConfigError: an untrusted stored configuration would make the scene contact an address, or write outside the run
@@ -125,7 +128,7 @@ def make_run_scene_context(config: RunConfig, progress: Progress) -> SceneContex
 
 
 def load_dataset(job: Job, progress: Progress = ignore_progress) -> Dataset:
-    """Load the data set of a run, in the coordinates of the stored model.
+    """Load the data set of a job. For a stored run, the data have the coordinates of the stored model.
 
     Raises:
         NeuprimError: the files or settings are wrong, or the loader crashed.
@@ -143,7 +146,7 @@ def load_dataset(job: Job, progress: Progress = ignore_progress) -> Dataset:
 
 
 def open_run(run: Path | StoredRun, progress: Progress = ignore_progress) -> TrainedModel:
-    """Return a run's model as exporters and inspectors take it. The scene is only loaded on demand.
+    """Load a run as the object that exporters and inspectors take. The scene's data are only loaded on demand.
 
     Raises the errors of :func:`load_run`.
     """
@@ -193,7 +196,10 @@ def read_metrics(run_dir: Path) -> dict[str, Any]:
 
 
 def kept_shares(model: Primitives) -> dict[str, float]:
-    """Return unit name (e.g. ``density.neuron 0``) -> fraction of its parameters that pruning has not removed, 0..1."""
+    """Return name -> fraction of parameters that pruning has not removed, 0..1, e.g. ``{"density.neuron 0": 0.8}``.
+
+    A name is that of a unit, whose parameters pruning sets to zero together, or of a group of units.
+    """
     kept: dict[str, float] = {}
     sizes: dict[str, int] = {}
     for name, unit in prunable_units_of_model(model.density, model.colour).items():

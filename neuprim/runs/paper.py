@@ -1,6 +1,6 @@
-"""``neuprim bench paper``: the tables of the paper that introduced the method, and runs that reproduce their rows.
+"""``neuprim bench paper``: compare runs with the tables of the paper that introduced the method.
 
-Runs are compared by ``psnr``, ``ssim_3dgs`` and ``lpips_3dgs``, which are computed like the numbers in such tables. A
+Runs are compared by ``psnr``, ``ssim_3dgs`` and ``lpips_3dgs``, which are computed by the conventions of such tables. A
 run is measured at its last checkpoint. The paper reports the best checkpoint on the test views.
 """
 
@@ -24,7 +24,7 @@ _OWN_NAMES = {"psnr": "psnr", "ssim": "ssim_3dgs", "lpips": "lpips_3dgs"}
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run for one table row and scene; table and row come from :func:`load_paper_run_tables`."""
+    """A run that reproduces one table row for one scene; :func:`load_paper_run_tables` returns tables and rows."""
 
     table: Mapping[str, Any]
     row: Mapping[str, Any]
@@ -33,7 +33,7 @@ class PlannedRun:
 
 
 def load_paper_run_tables() -> list[dict[str, Any]]:
-    """Load the paper's tables from ``paper_tables.yaml``. Lists in a row follow the order of the table's scenes."""
+    """Load the paper's tables from ``paper_tables.yaml``. Lists in a row have one number per scene, in order."""
     tables: list[dict[str, Any]] = yaml.safe_load(
         (resources.files(__package__) / "paper_tables.yaml").read_text(encoding="utf-8")
     )
@@ -108,9 +108,9 @@ def plan_paper_runs(
 def compare_run_with_paper(
     planned: PlannedRun, metrics: Mapping[str, Any]
 ) -> Iterator[tuple[str, float | None, float | None, float | None]]:
-    """Yield (metric, our value, the paper's value, the paper's baseline) of a finished run; None for missing values.
+    """Yield (metric, value of the run, value in the paper, value of the paper's baseline method) of a finished run.
 
-    LPIPS is left out unless it was measured with VGG, like the paper's LPIPS.
+    Missing values are None. The run's LPIPS counts as missing unless it was measured with VGG, like the paper's LPIPS.
     """
     table, row, scene = planned.table, planned.row, planned.scene
     for kind, name in _OWN_NAMES.items():

@@ -1,9 +1,9 @@
 """Render configurations of finished models: ``key=value`` overrides of ``neuprim render``, ``eval``, ``tradeoff``.
 
-renderer.KEY=VALUE       any setting of the renderer, over the run's own
+renderer.KEY=VALUE       replace a setting of the run's renderer
 resolution=0.5           render at half the width and height, and upsample bilinearly
-density.NAME=N           a smaller density, for example fewer neurons (Field.reductions)
-colour.NAME=N            a smaller colour: bands of spherical harmonics, lobes, terms in time
+density.NAME=N           reduce the density of all primitives, e.g. to fewer neurons (Field.reductions)
+colour.NAME=N            reduce their colour, e.g. to fewer bands of spherical harmonics, lobes or terms in time
 
 A view is rendered as an image, or as layers of one OpenEXR file. The file holds linear light and data such as depth;
 its header holds the camera and the conditions.
@@ -55,10 +55,10 @@ _REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # sRGB primaries: x
 
 
 def estimate_run_file_bytes(path: Path, full: Primitives, reduced: Primitives) -> int:
-    """Estimate the bytes of a run's model file if it held the model ``reduced`` instead of ``full``.
+    """Estimate the size in bytes that the model file at ``path`` would have with the model ``reduced``.
 
-    If both models have equally many values, the result is the size of the file. For a smaller model, a compressed or
-    sparse file counts as uncompressed float32 tensors.
+    The file holds the model ``full``. If both models have equally many values, the result is the size of the file. For
+    a smaller model and a compressed or sparse file, the result is the size of uncompressed float32 tensors.
     """
     before, after = (4 * model.count * model.parameters_per_primitive for model in (full, reduced))
     size = path.stat().st_size
@@ -80,7 +80,7 @@ class RenderConfig:
     reduced: Mapping[tuple[str, str], int] = field(default_factory=dict)
 
     def to_overrides(self, defaults: RenderSettings) -> tuple[str, ...]:
-        """Return the overrides from which :func:`parse_run_rendering` makes this configuration."""
+        """Return ``key=value`` texts that :func:`parse_run_rendering`, given ``defaults``, parses to this object."""
         before = dataclasses.asdict(defaults)
         values = dataclasses.asdict(self.settings)
         words = [
@@ -92,20 +92,20 @@ class RenderConfig:
         return (*words, *(f"{kind}.{name}={value}" for (kind, name), value in self.reduced.items()))
 
     def prepare_model(self, model: Primitives) -> Primitives:
-        """Return the model with reduced fields; the model itself if this configuration reduces none."""
+        """Return the model with this configuration's reductions, e.g. fewer neurons; unchanged if there are none."""
         for (kind, name), value in self.reduced.items():
             model = reduce_model(model, kind, name, value)
         return model
 
     def scale_view(self, view: View) -> View:
-        """Return the view with its camera scaled to ``resolution``."""
+        """Return the view with width and height of its camera's image multiplied by ``resolution``."""
         if self.resolution == 1.0:
             return view
         size = (max(1, round(self.resolution * side)) for side in (view.camera.width, view.camera.height))
         return replace(view, camera=view.camera.resized(*size))
 
     def upsample(self, image: Tensor, camera: AnyCamera) -> Tensor:
-        """Scale an image to the size of the camera, (H, W, C)."""
+        """Scale an (H, W, C) image bilinearly to the width and height of the camera."""
         size = (camera.height, camera.width)
         if image.shape[:2] == size:
             return image
@@ -173,10 +173,12 @@ def _format_run_render_override(key: str, value: Any) -> str:
 
 @dataclass(frozen=True)
 class RunExrLayers:
-    """Writer of a run's views as layers of OpenEXR files.
+    """Writer of a run's views as OpenEXR files, one file per view, with layers such as colour, alpha and depth.
 
     Attributes:
-        names: names of the layers, as after ``--layers``; None: all layers except those of single lights.
+        point: how to render the model.
+        names: comma-separated names of the layers, as after ``--layers``; None: all layers except those of single
+            lights.
         half: whether alpha and the layers that hold light are stored as 16-bit floats.
         background: (C,) in the model's colour space. Without an alpha layer, beauty is composited over it.
         lights: conditions of the lights of an environment map, over which images are summed; empty: the view's light.
@@ -206,7 +208,7 @@ class RunExrLayers:
 
     @property
     def _splits_lights(self) -> bool:
-        """Whether every light gets its own layer."""
+        """Whether each light of an environment map gets its own layer: whether the user named the layer "lights"."""
         return bool(self.lights) and self.names is not None and LIGHTS in [n.strip() for n in self.names.split(",")]
 
     def _layer_specs(self) -> tuple[LayerSpec, ...]:
@@ -247,9 +249,10 @@ class RunExrLayers:
     def _draw_layers(
         self, model: Primitives, view: View, present: dict[str, LayerSpec], on_alpha: Callable[[Tensor], None]
     ) -> dict[str, Tensor]:
-        """Return layer name -> (H, W, C) values that can be averaged over time: linear light, and depth times alpha.
+        """Render a view; return layer name -> (H, W, C) values.
 
-        The entry ``_COVERAGE`` is alpha. Layers that the model does not have are removed from ``present``.
+        The values can be averaged over sub-frames: colours are linear light, and depth is multiplied by alpha. The
+        entry ``_COVERAGE`` is alpha. Layers that the model does not have are removed from ``present``.
         """
         small, settings = self.point.scale_view(view), self.point.settings
         found: dict[str, Tensor] = {}
@@ -286,7 +289,12 @@ class RunExrLayers:
     def _exr_channels(
         self, found: Mapping[str, Tensor], specs: Mapping[str, LayerSpec]
     ) -> tuple[dict[str, ExrChannel], dict[str, str]]:
-        """Return channel name -> values, and header attributes for each layer, from means of :meth:`_draw_layers`."""
+        """Convert layers to OpenEXR channels; return channel name -> channel, and a header text for each layer.
+
+        Args:
+            found: layer name -> values of :meth:`_draw_layers`, averaged over sub-frames.
+            specs: layer name -> specification of the layer.
+        """
         channels: dict[str, ExrChannel] = {}
         summaries: dict[str, str] = {}
         for name, values in found.items():

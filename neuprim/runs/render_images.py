@@ -126,7 +126,7 @@ def render_run(
 
 
 class _RunRenderSession:
-    """A loaded run and the views that a request asks for."""
+    """State of one :func:`render_run` call: the loaded run, the model to render, and the views and lights to render."""
 
     def __init__(
         self,
@@ -173,7 +173,7 @@ class _RunRenderSession:
         self._passes, self._visible = 0, False  # images so far, as _count_pass counts them; any shows the model
 
     def _load_lights(self, environment: EnvironmentFile) -> Sequence[Conditions]:
-        """Return the conditions of the lights that together replace an environment map."""
+        """Return each light's conditions. Images under these lights add up to the image under the environment map."""
         with self.run.plugins.attribute_errors():
             illumination = self._illuminate(environment)
         lights = illumination.frames(environment.guesses)
@@ -206,7 +206,7 @@ class _RunRenderSession:
         return illumination
 
     def _load_views(self) -> tuple[list[View], float | None]:
-        """Return the request's views, in the model's coordinates, and the frames per second of an animation."""
+        """Return the views to render, in the model's coordinates, and the frames per second, None if not stated."""
         request, fps = self.request, self.request.fps
         if request.camera not in SETS:
             file = read_camera_file(Path(request.camera), request.size)
@@ -231,7 +231,10 @@ class _RunRenderSession:
         return _view_file_names([Path(self.request.camera.partition("#")[0]).resolve().stem])[0]
 
     def _choose_frames(self) -> tuple[list[int], Mapping[str, str]]:
-        """Return the frame numbers of ``--frame``, and the conditions with the times of these frames."""
+        """Return the source frame numbers that ``--frame`` names, and the conditions with the times of these frames.
+
+        Without ``--frame``, return no numbers and the conditions as the user gave them.
+        """
         text, conditions = self.request.frame, self.request.conditions
         if text is None:
             return [], conditions
@@ -309,14 +312,17 @@ class _RunRenderSession:
             return config.upsample(image, view.camera)
 
     def _count_pass(self, alpha: Tensor) -> None:
-        """Count a rendered image (one per view, sub-frame and light) with this alpha, and report the progress."""
+        """Count a rendered image, note whether its ``alpha`` shows the model, and report the progress.
+
+        Images are one per view, sub-frame of motion blur and light.
+        """
         each, count = max(len(self.lights), 1) * (self.shutter.samples if self.shutter else 1), len(self.views)
         self._visible |= bool((alpha > 0).any())
         self._passes += 1
         self.progress(f"view {-(-self._passes // each)} of {count}", self._passes / (each * count))
 
     def _refuse_empty_images(self) -> None:
-        """Raise DataError if no image shows the model; say where the model is and where the first camera looks."""
+        """Raise DataError if no image shows the model. The error states the model's box and the first camera's pose."""
         if self._visible:
             return
         view, where = self.views[0], "no primitive is there under these conditions"
@@ -347,7 +353,7 @@ def _run_views_of_camera_file(file: CameraViews, task: TaskSpec, conditions: Map
 def set_run_view_conditions(
     views: list[View], task: TaskSpec, texts: Mapping[str, str], warn: Callable[[str], None] = lambda text: None
 ) -> tuple[list[View], bool]:
-    """Return the views with the user's conditions, and whether a condition is animated.
+    """Return the views with the conditions (e.g. time) that the user typed, and whether a condition is animated.
 
     All animated conditions advance together, frame by frame. If there are more frames than cameras, or the reverse,
     the fewer ones are spread evenly over the others.

@@ -1,8 +1,8 @@
 """Train, measure, render and report a run in its directory, as one model or in chunks.
 
-In chunks: a run trains each chunk of the scene separately. Then the models of the chunks are joined, and trained as
-one model for the last part of the budget. ``chunks.json`` records the state of each chunk, so that a resumed run does
-not repeat finished chunks.
+In chunks: a run trains each chunk (part of the scene) separately. Then the models of the chunks are joined, and trained
+as one model for the last part of the budget. ``chunks.json`` records the state of each chunk, so that a resumed run
+does not repeat finished chunks.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _MIN_PRIMITIVES = 8
 
 
 class ChunksMissing(NeuprimError):
-    """Some chunks of a run failed. The message says which and why. Finished chunks stay on disk."""
+    """Error of a run of which some chunks failed. The message says which and why. Finished chunks stay on disk."""
 
 
 def run(
@@ -109,7 +109,13 @@ def summarize_run(run_dir: Path) -> str:
 
 
 def fit_job(data: Mapping[str, Any], attempt: int, events: Events) -> str:
-    """Run a configuration in a launcher's worker; return its directory. If ``attempt`` > 0, resume the checkpoint."""
+    """Train and measure a run in a worker process of a launcher; return the run's directory.
+
+    Args:
+        data: the configuration, as from :meth:`RunConfig.to_dict`.
+        attempt: how often the job's worker died before; above 0, the run resumes from its checkpoint.
+        events: function that is called with every event.
+    """
     config = RunConfig.from_dict(data)
     return str(run(replace(config, resume=config.resume or attempt > 0), events))
 
@@ -119,13 +125,14 @@ def fit_job(data: Mapping[str, Any], attempt: int, events: Events) -> str:
 
 @dataclass(frozen=True)
 class ChunkPlan:
-    """Plan of a run in chunks: the runs of the chunks, and the budget of the joined model's training.
+    """Plan of a run in chunks (parts of a scene): the runs of the chunks, and the budget for training the joined model.
 
     Attributes:
         chunks: the scene's chunks, with the function that joins their models.
         configs: configuration of each chunk's run.
         runs: entry of each chunk's run in ``chunks.json``.
         steps: training steps of the joined model; None: as many as fit into ``seconds``.
+        seconds: training time of the joined model; None: ``steps`` alone limit it.
     """
 
     chunks: Chunks
@@ -136,8 +143,9 @@ class ChunkPlan:
 
 
 def _plan_chunks(config: RunConfig, chunks: Chunks) -> ChunkPlan:
-    """Plan the chunks' runs: divide primitives and budget among them. Each run gets as many interventions of population
-    control as the whole run has.
+    """Plan one run per chunk (part of the scene): divide primitives and budget among the runs.
+
+    In each run, population control (adding and moving primitives) intervenes as often as in a run of the whole scene.
 
     Raises:
         ConfigError: ``model.primitives`` is too small for the number of chunks.
@@ -170,7 +178,7 @@ def _plan_chunks(config: RunConfig, chunks: Chunks) -> ChunkPlan:
 
 
 def _divide_primitives_among_chunks(total: int, shares: list[float]) -> list[int]:
-    """Split ``total`` in proportion to ``shares`` into whole numbers that add up to it."""
+    """Split ``total`` in proportion to ``shares`` into whole numbers that add up to ``total``."""
     ends = [round(total * sum(shares[: n + 1]) / sum(shares)) for n in range(len(shares))]
     return [end - begin for begin, end in zip([0, *ends], ends, strict=False)]
 
@@ -181,10 +189,10 @@ def train_in_chunks(
     launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
     between: BetweenSteps = lambda fitted, stop: None,
 ) -> tuple[Fitted, bool]:
-    """Train the chunks of ``scene.chunks``, join their models, and train the joined model.
+    """Train the chunks (parts of a scene) of ``scene.chunks``, join their models, and train the joined model.
 
-    If the scene finds that one run is better, train without chunks. Finished chunks are not repeated: the same command
-    with ``resume=true`` trains the missing ones. Returns as :func:`~neuprim.runs.training.train_in_directory`.
+    If the scene decides against chunks, train it as one run. Finished chunks are not repeated: the same command with
+    ``resume=true`` trains the missing ones. Return the trained model, and whether Ctrl-C ended the training.
 
     Args:
         launcher: where chunks are trained and their ground truth is rendered. This process trains the joined model.
@@ -232,7 +240,7 @@ def train_in_chunks(
 
 
 def _fit_chunks(plan: ChunkPlan, record: LaunchRecord, events: Events, launcher: LauncherSettings) -> LaunchRecord:
-    """Launch the runs of all unfinished chunks; return the updated record."""
+    """Launch the runs of all unfinished chunks, and report their joint progress; return the updated record of runs."""
     folder, count = record.file.parent, len(plan.configs)
     statuses = [JobStatus()] * count
 

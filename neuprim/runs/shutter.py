@@ -1,4 +1,4 @@
-"""Motion blur: an image is the mean of sub-frames, whose times are spread over the interval of an open shutter.
+"""Motion blur: an image is the mean of sub-frames, renderings at times spread over the interval of an open shutter.
 
 The shutter is centred on the frame, as in Blender and Arnold: it opens before the time of the frame and closes after
 it. The camera and the lights of an image do not move while the shutter is open.
@@ -37,7 +37,7 @@ class Shutter:
     limits: tuple[float, float]
 
     def sub_frames(self, view: View) -> list[View]:
-        """Return the view at the middles of ``samples`` equal parts of the open interval."""
+        """Return ``samples`` copies of a view. Their times are the middles of equal parts of the open interval."""
         time = view.conditions["time"]
         offsets = (self.fraction * self.interval * ((i + 0.5) / self.samples - 0.5) for i in range(self.samples))
         times = ((time.double() + offset).clamp(*self.limits).to(time) for offset in offsets)
@@ -47,11 +47,13 @@ class Shutter:
 def choose_shutter(
     fraction: float, samples: int, specs: Sequence[ConditionSpec], header: Mapping[str, Any], views: Sequence[View]
 ) -> Shutter:
-    """Return the shutter of ``--shutter`` for the views of a model.
+    """Return the shutter (motion blur) that ``--shutter FRACTION`` asks for, for the views of a model.
 
     Args:
-        specs: conditions of the task.
-        header: header of the model, see :func:`~neuprim.core.conditions.frame_interval`.
+        fraction: part of the interval between two frames in which the shutter is open, above 0 and at most 1.
+        samples: number of sub-frames of an image.
+        specs: conditions of the task (inputs of a frame besides its camera, such as the time).
+        header: header of the model's file, see :func:`~neuprim.core.conditions.frame_interval`.
         views: the views to render, with their conditions.
 
     Raises:
@@ -73,7 +75,7 @@ def choose_shutter(
 
 
 def mean_in_linear_light(images: Iterable[Tensor], color_space: str) -> Tensor:
-    """Return the mean of (H, W, C) images in ``color_space``, taken in linear light; negative sRGB values become 0."""
+    """Average (H, W, C) images in linear light; images and mean have ``color_space``. Negative sRGB values become 0."""
     if color_space == "linear":
         return torch.stack(list(images)).mean(0)
     return linear_to_srgb(torch.stack([srgb_to_linear(image.clamp_min(0.0)) for image in images]).mean(0))

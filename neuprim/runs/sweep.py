@@ -92,7 +92,9 @@ class LaunchRecord:
         return replace(self, runs=tuple(runs))
 
     def resume(self, before: LaunchRecord | None, more: bool) -> LaunchRecord:
-        """Return this record with the run states of an earlier record, ``before``, and with further runs of ``before``.
+        """Return this record with the states that its runs have in the earlier record ``before``.
+
+        Runs that only ``before`` contains are appended.
 
         Args:
             more: whether the two records may have different runs.
@@ -204,7 +206,7 @@ def _is_finished_run(run_dir: Path) -> bool:
 
 
 def read_sweep_overrides(words: Sequence[str]) -> list[str]:
-    """Return the overrides of the sweep to resume, followed by ``words``, the overrides typed now.
+    """Return the ``key=value`` overrides of the sweep to resume, followed by ``words``, the overrides typed now.
 
     ``words`` contain the sweep's ``output_dir`` and ``resume=true``.
 

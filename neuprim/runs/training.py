@@ -1,6 +1,7 @@
 """Train in a run directory, resume from its checkpoint, and fine-tune a changed model.
 
-Fine-tuning repeats the last part of a run's training: learning rates are similar, and the population is fixed.
+Fine-tuning trains a changed model, e.g. a pruned one, with schedules like those of the last part of a run's training.
+The number of primitives is fixed.
 """
 
 from __future__ import annotations
@@ -54,26 +55,28 @@ from neuprim.runs.open import discard_results
 CURVE_FILE, PREVIEW_FILE = "metrics.jsonl", "renders/preview.png"
 
 _PREVIEW_PROGRESS = (0.05, 0.5)
-"""Progress at which :data:`PREVIEW_FILE` is written; it is written again at the end of the run."""
+"""Used fractions of the budget at which :data:`PREVIEW_FILE` is written; it is written again at the end of the run."""
 
 BEGIN = 0.8
-"""Progress of the run, 0..1, whose schedules the first step of fine-tuning uses."""
+"""Progress of a run, 0..1. Fine-tuning begins with the values that the run's schedules have at this progress."""
 
 START, COOL = 3.0, 0.02
-"""Learning rates of fine-tuning: first step divided by the end of the run, and last step divided by first step.
-Rates near zero at the end let the parameters settle. This improves quality by itself, and matters most where
-parameters are rounded."""
+"""Learning rates of fine-tuning. START is the rate of the first step divided by the final rate of the run; COOL is the
+rate of the last step divided by that of the first. Rates near zero at the end let the parameters settle. This improves
+quality by itself, and matters most where parameters are rounded."""
 
 LONG, LEAST_START = 2000, 1.0
-"""Least number of steps with which the rates begin at :data:`START`. With fewer steps they begin proportionally lower,
-at :data:`LEAST_START` or more, because a few hundred steps at high rates degrade a well trained volume."""
+"""LONG is the least number of fine-tuning steps with which the learning rates begin at :data:`START`. With fewer steps
+they begin proportionally lower, but not below LEAST_START: a few hundred steps at high rates degrade a well trained
+volume."""
 
 VOXELS_EVERY = 8
-"""Largest number of steps between two steps with voxels, if the run trained with voxels. With the longer interval of a
-run, a few hundred steps miss some frames, whose extinction then drifts. With an interval of 4, images get worse."""
+"""Largest interval, in fine-tuning steps, between two steps that also use voxels (known extinction), if the run used
+voxels. The longer interval of a run makes a few hundred steps miss some frames, whose extinction then drifts. With an
+interval of 4, images get worse."""
 
 _PACE_WARMUP, _PACE_STEPS = 5, 20
-"""Number of warm-up steps, and of the steps after them that are timed."""
+"""Number of warm-up steps, and of timed steps after them, to measure the time per fine-tuning step."""
 
 BetweenSteps = Callable[[Fitted, threading.Event], None]
 """Callback on the training thread, before the first step and after every step. Its arguments are the training and
@@ -90,7 +93,8 @@ def train_in_directory(
     make: TrainerFactory | None = None,
 ) -> tuple[Fitted, bool]:
     """Train until the budget is used or the user presses Ctrl-C, which finishes the current step. In both cases write
-    configuration, curve, checkpoint and model into the run's directory. If several ranks train, the first one writes.
+    configuration, curve, checkpoint and model into the run's directory. If several ranks (processes) train the model,
+    only the first one writes.
 
     Args:
         dataset, hold_out, make, group: as in :func:`~neuprim.runs.fit.prepare_training`.
@@ -215,7 +219,7 @@ class RunPreview:
 
 
 def _train_run_as_follower(trainer: Trainer) -> bool:
-    """Train on a rank that writes no files; return whether the training was interrupted."""
+    """Train on a rank (process) that writes no files; return whether the training was interrupted, e.g. by Ctrl-C."""
     with interruptible_run(terminated=True) as stop, use_one_torch_thread_for_run():
         trainer.stop_requested = stop.is_set
         return any(trainer.stopping for _ in train_run_steps(trainer))
@@ -259,7 +263,7 @@ def add_run_curve_line(path: Path, line: str) -> None:
 
 
 def save_run_training(fitted: Fitted) -> None:
-    """Write checkpoint and model into the run's directory."""
+    """Write ``checkpoint.safetensors`` (to resume from) and ``model.safetensors`` into the run's directory."""
     trainer, config, dataset = fitted.trainer, fitted.config, fitted.dataset
     tensors, header = trainer.state()
     placement = {} if dataset.placement is None else dataset.placement.to_json()
@@ -286,11 +290,12 @@ def save_run_training(fitted: Fitted) -> None:
 def make_run_finetune_trainer(
     job: Job, dataset: Dataset, model: Primitives, steps: int, begin: float = BEGIN, voxels_every: int = VOXELS_EVERY
 ) -> Trainer:
-    """Make a trainer that fine-tunes a copy of a finished run's model for ``steps`` steps.
+    """Return a trainer that fine-tunes a copy of a finished run's model for ``steps`` steps.
 
     Schedules are those of the run from progress ``begin`` to 1, except for the learning rates (:data:`START`,
-    :data:`COOL`). The population is fixed, and views have their full resolution. If the run has a checkpoint, the
-    exposures and corrections of its views are continued.
+    :data:`COOL`). The number of primitives is fixed, and steps render whole views. If the run has a checkpoint, the
+    trained exposures and camera corrections of its views are loaded from it. ``voxels_every`` is the largest interval
+    between steps with voxels (:data:`VOXELS_EVERY`).
     """
     config, params = job.config, {name: value.detach().clone() for name, value in model.params.items()}
     copy = Primitives(model.density, model.colour, params)

@@ -3,4 +3,4 @@
 __all__ = ["PIXEL_CLASSES"]
 
 PIXEL_CLASSES = ("background", "lit", "cast_shadow", "attached_shadow", "highlight")
-"""Names of the values 0 to 4 in the class maps of lit solids."""
+"""Names of the pixel classes 0 to 4, which the images ``*_classes.png`` of the scene ``lit_solids`` store."""

@@ -54,10 +54,10 @@ def scene_camera_pose(eye: NDArray[np.float64]) -> NDArray[np.float64]:
 def scene_ray_bands(
     pose: NDArray[np.float64], field_of_view: float, size: int, samples: int
 ) -> Iterator[NDArray[np.float64]]:
-    """Yield (N, 3) unit ray directions, whole rows of pixels at a time, from the top.
+    """Yield (N, 3) unit ray directions of a square image, a band of whole pixel rows at a time, from the top.
 
-    A pixel has ``samples`` x ``samples`` rays. ``pose`` is the (4, 4) camera-to-world matrix, OpenGL axes.
-    ``field_of_view``, radians, is the same along both axes.
+    The image has ``size`` x ``size`` pixels, and a pixel has ``samples`` x ``samples`` rays. ``pose`` is the (4, 4)
+    camera-to-world matrix, OpenGL axes. ``field_of_view``, radians, is the same along both axes.
     """
     fine = size * samples
     plane = ((np.arange(fine) + 0.5) / fine * 2 - 1) * math.tan(field_of_view / 2)  # at distance 1
@@ -70,7 +70,7 @@ def scene_ray_bands(
 
 
 def average_scene_rays(values: NDArray[np.float32], size: int, samples: int) -> NDArray[np.float32]:
-    """Average (N, C) values of the rays of one band of :func:`scene_ray_bands` to (rows, size, C) pixels."""
+    """Average the (N, C) values of the rays of one band (:func:`scene_ray_bands`) per pixel; return (rows, size, C)."""
     channels = values.shape[1]
     rows = len(values) // (size * samples * samples)
     across = values.reshape(rows, samples, size, samples * channels).mean(axis=1)
@@ -78,7 +78,7 @@ def average_scene_rays(values: NDArray[np.float32], size: int, samples: int) -> 
 
 
 def draw_in_parallel(work: Callable[[T], object], jobs: Sequence[T], progress: Callable[[float], None]) -> None:
-    """Call ``work`` with each of ``jobs`` in threads; ``progress`` gets the fraction done. Errors cancel the rest."""
+    """Call ``work`` with each job, in threads. ``progress`` gets the fraction done; an error cancels the rest."""
     pool = ThreadPoolExecutor(min(_MAX_THREADS, os.cpu_count() or 1))
     try:
         for done, _ in enumerate(pool.map(work, jobs), start=1):
@@ -94,7 +94,10 @@ def scene_drawing_text(name: str, scene: Scene, width: int, height: int) -> str:
 
 
 def write_scene_folder(final: Path, files: Iterable[str], write: Callable[[Path], None], what: str) -> Path:
-    """Create the folder ``final`` unless it has all ``files``. It appears only after ``write`` has written them."""
+    """Create the folder ``final``, unless it has all ``files``, and return it.
+
+    ``write`` fills a temporary folder, which is then renamed. ``what`` begins the message of a DataError.
+    """
     names = tuple(files)
     try:
         publish_folder(final, write, lambda folder: all((folder / name).is_file() for name in names))

@@ -4,7 +4,7 @@
     train/r_0000.exr                 RGBA, linear radiance over the exposure, premultiplied, half floats
     train/r_0000_unshadowed.exr      the same image without cast shadows
     train/r_0000_classes.png         8-bit grey, index into :data:`neuprim.scenes.PIXEL_CLASSES`
-    test/new_light_03_nearest.exr    test views only: the view under the nearest of 25 training lights
+    test/new_light_03_nearest.exr    test views only: the same view, lit by the nearest of 25 training lights
 
 A pixel's class is background if fewer than half of its rays hit a surface. Otherwise, if more than half of the rays
 that hit have the same class, the pixel has that class; if not, it is "lit". The light has the intensity
@@ -48,14 +48,14 @@ GENERATOR_VERSION = 1
 DISTANCE = (4.0, 5.0)  # least and largest distance of cameras and lights from the origin, scene units
 
 FIELD_OF_VIEW = 2 * float(np.arcsin(1.19 / DISTANCE[0]))
-"""Field of view, radians. From the nearest camera, it contains the sphere of radius 1.19 around the scene."""
+"""Field of view, radians. The nearest camera sees the whole sphere of radius 1.19 around the origin."""
 
 INTENSITY = 69.2
 """Radiant intensity of the lights divided by the exposure. With default settings, the 99.5th percentile of the training
 images is 1."""
 
 PARTS = ("new_view", "new_light", "new_both")
-"""Parts of the test split: new camera under a training light, training camera under a new light, and both new."""
+"""Parts of the test split: new camera with a training light, training camera with a new light, and both new."""
 
 NEAR_LIGHTS = 25  # the baseline "nearest light" knows the lights of this many training images, the first ones
 
@@ -63,14 +63,14 @@ CIRCLE_FRAMES = 36
 _CAMERA_POLAR, _LIGHT_POLAR = math.radians(75.0), math.radians(60.0)
 
 _BRIGHT = 0.5 / (np.pi * (sum(DISTANCE) / 2) ** 2)
-"""Least radiance per unit intensity of a pixel of the class "highlight", 1/length^2."""
+"""Least radiance of highlights for the pixel class "highlight", divided by the light's intensity, 1/length^2."""
 
 _LIT, _CAST, _ATTACHED, _HIGHLIGHT = map(PIXEL_CLASSES.index, ("lit", "cast_shadow", "attached_shadow", "highlight"))
 
 
 @dataclass(frozen=True)
 class LitSettings:
-    """Settings of the images of ``scene=lit_solids``: size in pixels, images per split, n for n x n rays per pixel."""
+    """Settings of ``scene=lit_solids``: image width and height in pixels, images per split, rays per pixel per axis."""
 
     size: ImageSize = 256
     train_views: Annotated[int, Range(1, 100000)] = 500
@@ -85,7 +85,10 @@ class LitSettings:
 
 
 class LitView(NamedTuple):
-    """A view of ``lit_solids``: (3,) positions of camera, light and, in test views, the nearest training light."""
+    """A view of ``lit_solids``: its name and the (3,) positions of camera and light.
+
+    In test views, ``near_light`` is the training light whose direction is closest, for a simple baseline image.
+    """
 
     name: str
     camera: NDArray[np.float64]
@@ -94,7 +97,10 @@ class LitView(NamedTuple):
 
 
 class LitImage(NamedTuple):
-    """Image of ``lit_solids``: premultiplied radiance with alpha, radiance without cast shadows, and pixel classes."""
+    """Image of ``lit_solids``: radiance, radiance without cast shadows, both (H, W, 4) with premultiplied alpha.
+
+    ``classes`` (H, W) are indices into :data:`neuprim.scenes.PIXEL_CLASSES`.
+    """
 
     rgba: NDArray[np.float32]
     unshadowed: NDArray[np.float32]
@@ -181,7 +187,7 @@ def place_cameras_and_lights(train_views: int, test_views: int) -> dict[str, lis
 
 
 def _draw_lit_positions(key: int, count: int) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
-    """Draw positions of ``count`` cameras and ``count`` lights. A larger ``count`` does not change the first ones."""
+    """Draw random positions of ``count`` cameras and lights, seeded by ``key``. A larger ``count`` only adds some."""
     numbers = np.random.default_rng([20241208, key]).random((count, 6))
     return [_position_above_lit_solids(n[:3], _CAMERA_POLAR) for n in numbers], [
         _position_above_lit_solids(n[3:], _LIGHT_POLAR) for n in numbers
@@ -189,7 +195,7 @@ def _draw_lit_positions(key: int, count: int) -> tuple[list[NDArray[np.float64]]
 
 
 def _position_above_lit_solids(numbers: NDArray[np.float64], polar: float) -> NDArray[np.float64]:
-    """Map three uniform numbers 0..1 to a position, uniform in direction within angle ``polar`` of the zenith."""
+    """Map three numbers 0..1 to a position (3,); its direction is uniform within ``polar`` radians of the zenith."""
     cosine = 1.0 - numbers[0] * (1.0 - math.cos(polar))
     return (DISTANCE[0] + numbers[2] * (DISTANCE[1] - DISTANCE[0])) * scene_direction(cosine, 2 * math.pi * numbers[1])
 
@@ -198,7 +204,10 @@ def _position_above_lit_solids(numbers: NDArray[np.float64], polar: float) -> ND
 
 
 def build_lit_solids() -> list[Solid]:
-    """Build ``lit_solids``: solids without the plate, a bright slab that shows shadows, a dark ring with highlights."""
+    """Build the bodies of the scene ``lit_solids``: those of the scene ``solids`` without the plate, and two more.
+
+    The two are a bright slab, on which shadows are visible, and a dark ring with highlights.
+    """
     thick, edge, major, minor = 0.1, 0.012, 0.235, 0.1
     profile = [(0.0, 1.0 - edge), (edge, 1.0), (thick - edge, 1.0), (thick, 1.0 - edge)]
     slab = lathe([0, 0, FLOOR - thick], [0, 0, 1], profile, sections=256)

@@ -16,7 +16,7 @@ from neuprim.scenes.shapes import Solid, solid_corner_normals
 Engine = Literal["auto", "embree", "numba"]
 
 LIFT = 2e-4
-"""Distance of shadow rays' origins from the surface, scene units: a hundred times the rounding error of float32."""
+"""Offset of shadow ray origins from the surface, scene units; a hundred times the rounding error of float32."""
 
 _LEAF = 4  # most triangles per leaf
 _DEPTH = 64  # size of the traversal's stack; median splits of 2^31 triangles need 32
@@ -48,7 +48,10 @@ class Hits:
 
 
 class Scene:
-    """A set of solids for ray queries, with ``engine`` "embree" or "numba". Read-only, so threads may share a scene."""
+    """A set of solids for ray queries. Queries change nothing, so threads may share a scene.
+
+    ``engine`` is "embree" or "numba"; "auto" takes Embree if it is installed.
+    """
 
     def __init__(self, solids: Sequence[Solid], engine: Engine = "auto") -> None:
         self.solids = tuple(solids)
@@ -84,7 +87,10 @@ class Scene:
         return Hits(hit, position, distance, normal, face, albedo, gloss, specular, owner, triangle, weight)
 
     def _first_hits(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Return four (N,) arrays of N rays: triangle or -1, barycentric u and v, and distance in lengths of ``d``."""
+        """Return the first hits of N rays with origins ``o`` and directions ``d``, both (N, 3), as four (N,) arrays.
+
+        They are the triangle's index or -1, barycentric u and v, and the distance in lengths of ``d``.
+        """
         return self._search.first(o, d)
 
     def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
@@ -139,7 +145,10 @@ class _EmbreeEngine:
 
 
 class _BoxHierarchy:
-    """Bounding volume hierarchy of F triangles with vertices (V, 3) and indices (F, 3); queries as _EmbreeEngine."""
+    """Bounding volume hierarchy of F triangles with vertices (V, 3) and indices (F, 3).
+
+    It has the same methods as :class:`_EmbreeEngine`.
+    """
 
     def __init__(self, vertices: NDArray, faces: NDArray) -> None:
         corners = vertices[faces].astype(np.float64)
@@ -159,8 +168,11 @@ class _BoxHierarchy:
 
 
 def _build_box_tree(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Build the tree of triangles with bounding boxes ``low``, ``high``; return the triangles' order, the nodes' boxes
-    and the nodes' links: (first child, 0) for an inner node, (first triangle, count) for a leaf."""
+    """Build a bounding volume hierarchy of F triangles, given the corners ``low`` and ``high`` (F, 3) of their boxes.
+
+    Return the (F,) order of the triangles, the lower and upper corners of the nodes' boxes, and the nodes' links. A
+    link is (first child, 0) for an inner node, and (first triangle, count) for a leaf.
+    """
     order = np.arange(len(low))
     middle = (low + high) / 2
     boxes: list[tuple[NDArray, NDArray]] = [(low[:0], high[:0])]
@@ -187,7 +199,10 @@ def _build_box_tree(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray, NDAr
 
 @numba.njit(nogil=True, error_model="numpy")
 def _raycast_box_entry(low, high, node, o, inverse, limit):  # type: ignore[no-untyped-def]
-    """Return the distance at which a ray from ``o`` enters the box of ``node``; infinity if not before ``limit``."""
+    """Return the distance at which a ray from ``o`` enters a node's box, or infinity if it does not before ``limit``.
+
+    ``inverse`` is 1 / direction of the ray, per axis.
+    """
     near, far = 0.0, limit
     for axis in range(3):
         a, b = (low[node, axis] - o[axis]) * inverse[axis], (high[node, axis] - o[axis]) * inverse[axis]
@@ -200,7 +215,7 @@ def _raycast_box_entry(low, high, node, o, inverse, limit):  # type: ignore[no-u
 
 @numba.njit(nogil=True, error_model="numpy")
 def _intersect_triangle(corner, o, d):  # type: ignore[no-untyped-def]
-    """Intersect a ray with a triangle (3, 3); return barycentric u, v and the distance, -1 without a hit."""
+    """Intersect the ray ``o`` + t ``d`` with a triangle (3, 3); return barycentric u, v, and t, or -1 without a hit."""
     ex, ey, ez = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
     fx, fy, fz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
     px, py, pz = d[1] * fz - d[2] * fy, d[2] * fx - d[0] * fz, d[0] * fy - d[1] * fx

@@ -1,8 +1,8 @@
 """Generator of the scene ``room``: simulated photographs from a walk around the solids, with lens distortion.
 
-transforms.json, images/...    layout of nerfstudio, with OpenCV's lens distortion and a split
-points.ply                     simulated reconstruction: points where there is detail, a few of them wrong
-exposures.json                 the factor that each image is multiplied by
+transforms.json, images/...    layout of nerfstudio, with OpenCV's lens distortion and a train/test split
+points.ply                     simulated structure from motion: points where there is detail, a few of them wrong
+exposures.json                 image -> the exposure factor by which its linear values are multiplied
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def build_room(settings: RoomSettings) -> Room:
 
 
 def room_exposure_gains(count: int, stops: float) -> NDArray[np.float64]:
-    """Return (count,) exposure factors of training images; their log2 is uniform in -``stops``..``stops``."""
+    """Return (count,) random exposure factors of training images; their log2 is uniform in -``stops``..``stops``."""
     return 2.0 ** (stops * (2 * np.random.default_rng(_EXPOSURE_SEED).random(count) - 1))
 
 
@@ -172,7 +172,7 @@ class RoomLens:
 
     @property
     def camera(self) -> Camera:
-        """Pinhole camera of the undistorted image, at the identity pose; its principal point is slightly off centre."""
+        """Pinhole camera without distortion, at the identity pose. The principal point is slightly off centre."""
         centre = 0.504 * self.width, 0.495 * self.height
         return Camera(torch.eye(4, dtype=torch.float64), self.focal, self.focal, *centre, self.width, self.height)
 
@@ -188,7 +188,10 @@ class RoomLens:
         return local @ pose[:3, :3].T
 
     def _undistort(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Invert :meth:`pixels` by fixed-point iteration, which converges because the distortion is small."""
+        """Convert (M, 2) distorted pixels to (M, 2) directions (x/z, y/z), the inverse of :meth:`pixels`.
+
+        The fixed-point iteration converges because the distortion is small.
+        """
         middle = [self.camera.cx, self.camera.cy]
         bent = (pixels - middle) / self.focal
         points = bent.copy()
@@ -200,7 +203,10 @@ class RoomLens:
         return points
 
     def ray_bands(self, pose: NDArray[np.float64], samples: int) -> Iterator[NDArray[np.float64]]:
-        """Yield (N, 3) unit ray directions for bands of pixel rows, ``samples`` x ``samples`` rays per pixel."""
+        """Yield (N, 3) unit ray directions, a band of pixel rows at a time; ``samples`` x ``samples`` per pixel.
+
+        ``pose`` (4, 4) is camera to world.
+        """
         across = (np.arange(self.width * samples) + 0.5) / samples
         down = (np.arange(self.height * samples) + 0.5) / samples
         rows = max(1, RAYS_AT_ONCE // (len(across) * samples)) * samples
@@ -217,7 +223,10 @@ def room_lens(settings: RoomSettings) -> RoomLens:
 def photograph_room(
     room: Room, lens: RoomLens, pose: NDArray[np.float64], supersampling: int, gain: float = 1.0
 ) -> NDArray[np.uint8]:
-    """Render a photograph, (H, W, 3) uint8 sRGB. Rays are averaged in linear light, then multiplied by ``gain``."""
+    """Render a photograph, (H, W, 3) uint8 sRGB, from ``pose``, (4, 4) camera to world with OpenGL axes.
+
+    The rays of a pixel are averaged in linear light, then multiplied by the exposure factor ``gain``.
+    """
     bands = (room_lamplight_radiance(room, pose[:3, 3], d) for d in lens.ray_bands(pose, supersampling))
     mean = np.concatenate([average_scene_rays(band, lens.width, supersampling) for band in bands])
     return np.round(encode_scene_srgb(mean * np.float32(gain)) * 255).astype(np.uint8)
@@ -227,7 +236,10 @@ def photograph_room(
 
 
 def room_walk_positions(train: int, test: int) -> dict[str, NDArray[np.float64]]:
-    """Return the views' positions on the walk, 0..1, by split. Training views lie between evenly spaced test views."""
+    """Return {"train": (train,), "test": (test,)}: the positions of the views along the camera's walk, 0..1.
+
+    Test views are evenly spaced, and training views lie between them.
+    """
     held_out = (np.arange(test) + 0.5) / test
     gap = np.arange(train) * test // train
     first = np.searchsorted(gap, gap)
@@ -236,7 +248,7 @@ def room_walk_positions(train: int, test: int) -> dict[str, NDArray[np.float64]]
 
 
 def room_camera_poses(train: int, test: int) -> dict[str, list[NDArray[np.float64]]]:
-    """Return (4, 4) camera-to-world matrices, OpenGL axes, by split; test poses do not depend on ``train``."""
+    """Return split -> (4, 4) camera-to-world matrices, OpenGL axes. Test poses do not depend on ``train``."""
     poses = {}
     for split, times in room_walk_positions(train, test).items():
         shake = 2 * np.random.default_rng(_WALKS_SEEDS[split]).random((len(times), 7)) - 1
@@ -245,7 +257,10 @@ def room_camera_poses(train: int, test: int) -> dict[str, list[NDArray[np.float6
 
 
 def _walk_pose(t: float, shake: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (4, 4) pose at ``t``, 0..1, of a walk of two rounds; ``shake`` (7,), -1..1, moves eye, aim, roll."""
+    """Return the (4, 4) camera-to-world matrix at position ``t``, 0..1, of a walk twice around the solids.
+
+    ``shake`` (7,), random numbers -1..1, disturbs position (3), aim (3) and roll (1).
+    """
     turn = 2 * math.pi
     distance = 3.55 + 0.8 * math.sin(turn * (5 * t + 0.15)) + 0.12 * shake[0]
     height = 1.1 - 0.6 * math.cos(turn * t) + 0.1 * math.sin(turn * 7 * t) + 0.06 * shake[1]
@@ -264,7 +279,7 @@ def _walk_pose(t: float, shake: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class ReconstructedPoints(NamedTuple):
-    """N points of a simulated reconstruction."""
+    """N points of a simulated structure-from-motion reconstruction."""
 
     # surface, position: (N, 3) float64 true positions, and positions according to the reconstruction
     surface: NDArray[np.float64]
@@ -281,7 +296,7 @@ def reconstruct_room_points(
     luma: Callable[[int], NDArray[np.float32]],
     count: int,
 ) -> ReconstructedPoints:
-    """Simulate a reconstruction: return ``count`` points that at least two training cameras see.
+    """Simulate structure from motion: return ``count`` points, with errors, that two or more training cameras see.
 
     Points are drawn where the images have detail; ``luma`` maps a camera's index to the (H, W) brightness. ``poses``
     (4, 4) are camera to world. Raises ConfigError if too few surfaces are seen by two cameras.
@@ -321,7 +336,7 @@ def reconstruct_room_points(
 
 
 def _room_pixel_detail_chances(luma: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return (H * W,) cumulative probabilities of pixels; a pixel's probability grows with its brightness gradient."""
+    """Return the (H * W,) cumulative probabilities with which pixels are drawn; brightness gradients increase them."""
     down, across = np.gradient(luma.astype(np.float64))
     detail = np.hypot(down, across)
     total = np.cumsum((detail + _PLAIN * max(detail.mean(), 1e-6)).ravel())
@@ -356,9 +371,9 @@ _GRAZING = np.float32(0.04)  # least cosine of the angle of incidence in the wid
 
 
 class Room(Scene):
-    """Scene of solids and furnishings, with textures averaged over ray footprints.
+    """Scene of solids and furnishings. Textures are averaged over the footprints of rays, which prevents aliasing.
 
-    ``spacing`` is the distance of neighbouring rays at distance 1 from the camera.
+    ``spacing`` is the distance between neighbouring rays at distance 1 from the camera.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Furnishings of the scene ``room``, and textures that are averaged over the width of a ray."""
+"""Furnishings of the scene ``room``, with procedural textures that are averaged over the width of a ray."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from neuprim.scenes.shapes import (
 Array = NDArray[np.float32]
 
 Texture = Callable[[Array, Array], Array]
-"""(M, 3) positions and (M,) ray widths, both in scene units -> (M, 3) linear RGB reflectance 0..1."""
+"""Function: (M, 3) positions and (M,) ray widths, both in scene units -> (M, 3) linear RGB reflectance 0..1."""
 
 _PRIMES = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)
 
@@ -60,7 +60,7 @@ def lattice_noise(points: Array, width: Array, cell: float, seed: int, octaves: 
 
 
 def cell_random(index: NDArray[np.integer], seed: int) -> Array:
-    """Return (M,) uniform numbers 0..1, hashed from the integer coordinates ``index`` (M, D)."""
+    """Return (M,) pseudo-random uniform numbers 0..1, hashed from the integer coordinates ``index`` (M, D)."""
     h = np.full(len(index), (seed * 0x27D4EB2F + 0x165667B1) & 0xFFFFFFFF, dtype=np.uint32)
     for axis in range(index.shape[1]):
         h = (h ^ index[:, axis].astype(np.int64).astype(np.uint32)) * np.uint32(_PRIMES[axis % 3])
@@ -73,7 +73,10 @@ def cell_random(index: NDArray[np.integer], seed: int) -> Array:
 
 
 def mix_colours(one: Array, other: Array, share: Array) -> Array:
-    """Return (M, 3) blended colours. ``share``: (M,), 0 gives ``one``, 1 gives ``other``; both (3,) or (M, 3)."""
+    """Blend two colours linearly; return (M, 3). ``one`` and ``other`` are (3,) or (M, 3).
+
+    ``share`` (M,) is clipped to 0..1: 0 gives ``one``, 1 gives ``other``.
+    """
     t = np.clip(share, 0, 1)[:, None].astype(np.float32, copy=False)
     return one + t * (other - one)
 
@@ -101,7 +104,7 @@ def _lattice_noise(points: Array, seed: int) -> Array:
 
 
 def speckled(code: str, seed: int, strength: float = 0.12, cell: float = 0.5) -> Texture:
-    """Return a texture of uneven paint in one colour."""
+    """Return a texture of uneven paint: one colour, "#rrggbb", whose brightness varies by noise of size ``cell``."""
     colour = parse_solid_srgb(code)
     return lambda p, w: np.clip(colour * (1 + np.float32(strength) * lattice_noise(p, w, cell, seed))[:, None], 0, 1)
 
@@ -144,7 +147,7 @@ def bricks(u: int, v: int, seed: int, width: float = 0.62, height: float = 0.22,
 
 
 def chequered(one: str, other: str, u: int, v: int, cell: float, seed: int) -> Texture:
-    """Return a texture of worn squares in two colours, with fine joints."""
+    """Return a texture of worn squares in two colours, with fine joints. ``u``, ``v`` are the indices of the axes."""
     first, second = parse_solid_srgb(one), parse_solid_srgb(other)
 
     def texture(p: Array, w: Array) -> Array:
@@ -179,7 +182,7 @@ def wallpaper(u: int, v: int, seed: int) -> Texture:
 
 
 def plaster(u: int, v: int, seed: int, panel: float) -> Texture:
-    """Return a texture of rough ochre plaster, with upright boards below the height ``panel``."""
+    """Return a wall texture: rough ochre plaster, and upright boards below the height ``panel``, scene units."""
     light, dark, board, seam, edge = map(parse_solid_srgb, ("#e6c98c", "#b0764a", "#5d6f86", "#2f3a4a", "#efe9dc"))
     narrow = np.array([1, 0.2], np.float32)
 
@@ -321,7 +324,10 @@ def _room_corner_boxes(*corners: tuple[Corner, Corner], chamfer: float = 0.02) -
 def _picture_frame(
     x: float, y: float, low: float, high: float, half: float, along: int, width: float, depth: float
 ) -> trimesh.Trimesh:
-    """Build a frame of four bars around an opening of half width ``half``, between the heights ``low`` and ``high``."""
+    """Build a frame of four bars around an opening in a wall, centred at ``x``, ``y``.
+
+    The opening is 2 ``half`` wide along the axis with index ``along``, and reaches from height ``low`` to ``high``.
+    """
     middle = np.array([x, y, (low + high) / 2])
     side = np.eye(3)[along]
     upright, level = np.full(3, depth), np.full(3, depth)
@@ -386,7 +392,7 @@ def _lamp_furnishings() -> list[Furnishing]:
 
 
 def _brick_side_furnishings() -> list[Furnishing]:
-    """Build the wall at x = 6: a window with four panes, and crates below."""
+    """Build the furnishings at the brick wall, x = 6: a window with four panes, and crates."""
     x, low, high = HIGH[0], 0.2, 2.4
     pane = _room_corner_box((x - 0.02, -1.4, low), (x + 0.05, 1.4, high), 0.005)
     upright = _room_corner_box((x - 0.1, -0.05, low), (x, 0.05, high), 0.01)
@@ -408,7 +414,7 @@ def _brick_side_furnishings() -> list[Furnishing]:
 
 
 def _plaster_side_furnishings() -> list[Furnishing]:
-    """Build the wall at y = 6: a shelf full of books, and a picture in a frame."""
+    """Build the furnishings at the plastered wall, y = 6: a shelf full of books, and a picture in a frame."""
     y0, y1, left, right, z, step = 5.3, 6.0, -4.6, -1.6, -1.6, 0.62
     boards = [((left, y0, z + step * i), (right, y1, z + step * i + 0.06)) for i in range(6)]
     sides = (left - 0.08, (left + right) / 2, right)
@@ -429,7 +435,7 @@ def _plaster_side_furnishings() -> list[Furnishing]:
 
 
 def _wallpaper_side_furnishings() -> list[Furnishing]:
-    """Build the wall at x = -6: a long bench, two pictures above it, and a pillar in the corner."""
+    """Build the furnishings at the papered wall, x = -6: a bench, two pictures above it, and a pillar in the corner."""
     column = [(0.0, 0.62), (0.2, 0.62), (0.3, 0.45), (4.7, 0.42), (4.8, 0.6), (5.0, 0.6)]
     bench = [
         _room_corner_box((-5.95, -2.6, -1.35), (-5.15, 1.4, -1.1), 0.05),
@@ -453,7 +459,7 @@ def _wallpaper_side_furnishings() -> list[Furnishing]:
 
 
 def _tile_side_furnishings() -> list[Furnishing]:
-    """Build the wall at y = -6: a cupboard, a door and a big pot."""
+    """Build the furnishings at the tiled wall, y = -6: a cupboard, a door, and a big pot with a bush."""
     places = [(x, z) for x in (-4.3, -3.55, -2.8) for z in (-1.4, -0.3)]
     panels = _room_corner_boxes(*(((x, -5.27, z), (x + 0.62, -5.22, z + 0.95)) for x, z in places))
     places = [(x, z) for x in (1.45, 2.2) for z in (-1.4, 0.1)]

@@ -1,6 +1,8 @@
 """Shading of the generated scenes: Lambertian reflectance plus a normalised Blinn-Phong highlight,
 
-f = albedo / pi + k (n + 8) / (8 pi) (N.H)^n,     k = specular gloss,  n = 6 + 110 gloss^2.
+f = albedo / pi + k (n + 8) / (8 pi) (N.H)^n,     k = specular gloss,  n = 6 + 110 gloss^2,
+
+where N is the surface normal and H the half vector between the directions to the eye and to the light.
 """
 
 from __future__ import annotations
@@ -36,9 +38,9 @@ def shading_dot(a: Array, b: Array) -> Array:
 
 
 def reflectance_lobes(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> tuple[Array, Array]:
-    """Return, per hit, the cosine of normal and light, at least 0, and pi times the highlight's reflectance.
+    """Return two (M,) arrays for M surface hits: cosine of the angle between normal and light, and highlight.
 
-    Directions are unit vectors.
+    The cosine is at least 0. The highlight is its reflectance times pi. ``to_eye``, ``to_light`` are unit vectors.
     """
     eye, light = np.asarray(to_eye, dtype=np.float32), np.asarray(to_light, dtype=np.float32)
     cosine = np.maximum(shading_dot(hits.normal, light), 0)
@@ -52,7 +54,7 @@ def reflectance_lobes(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> tup
 
 
 def reflect_light(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> Array:
-    """Return (M, 3) linear RGB radiance from the hits to the eye, per unit irradiance on a surface facing the light."""
+    """Return the (M, 3) linear RGB radiance that M hits reflect, per unit irradiance of a surface facing the light."""
     cosine, highlight = reflectance_lobes(hits, to_eye, to_light)
     return ((hits.albedo + highlight[:, None]) * (cosine / np.float32(np.pi))[:, None]).astype(np.float32)
 
@@ -77,9 +79,9 @@ def scene_daylight_radiance(
 
 
 def scene_light_visibility(scene: Scene, hits: Hits, to_light: Array, away: ArrayLike) -> NDArray[np.bool_]:
-    """Return (M,) bool: whether light from ``to_light`` (M, 3) reaches the hits.
+    """Return (M,) bool: whether light from the directions ``to_light`` (M, 3) reaches M surface hits.
 
-    ``away`` is the distance of the light in lengths of ``to_light``.
+    ``away`` is the distance to the light, in lengths of ``to_light``; infinite for the sun.
     """
     lit: NDArray[np.bool_] = shading_dot(hits.face, to_light) > 0  # what faces away is in its own shadow: no ray needed
     lit[lit] = ~scene.occluded(hits.lifted()[lit], to_light[lit], np.broadcast_to(away, len(lit))[lit])
@@ -87,7 +89,7 @@ def scene_light_visibility(scene: Scene, hits: Hits, to_light: Array, away: Arra
 
 
 def add_scene_surroundings(rgb: Array, hits: Hits, to_eye: Array, sky: Colour, ground: Colour) -> None:
-    """Add to ``rgb`` (M, 3) the reflected ambient light: radiance ``sky`` from above, ``ground`` from below."""
+    """Add reflected ambient light to ``rgb`` (M, 3), in place: radiance ``sky`` from above, ``ground`` from below."""
 
     def surroundings(height: Array) -> Array:
         t = (0.5 + 0.5 * height)[:, None]

@@ -17,7 +17,7 @@ Albedo = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 FLOOR = -0.52  # height of the plate's upper side, on which everything stands
 
 _CREASE = np.cos(np.radians(24.0))
-"""Crease angle: faces that meet at a larger angle are not smoothed, so chamfers stay hard, round parts smooth."""
+"""Cosine of the crease angle. Normals are smoothed across faces that meet at a smaller angle; chamfers stay hard."""
 
 _CORNERS_AT_ONCE = 1 << 18  # bounds the memory for pairs of corners
 
@@ -34,7 +34,7 @@ def chamfered_box(size: ArrayLike, centre: ArrayLike, chamfer: float) -> trimesh
 
 
 def pyramid(base: float, height: float, centre: ArrayLike, turn: float) -> trimesh.Trimesh:
-    """Build a pyramid on a square base of edge ``base`` around ``centre``, rotated by ``turn`` radians about z."""
+    """Build a pyramid on a square of edge ``base``, centred at ``centre`` and turned by ``turn`` radians about z."""
     angles = turn + np.pi / 4 + np.pi / 2 * np.arange(4)
     square = np.stack([np.cos(angles), np.sin(angles), np.zeros(4)], axis=1) * base / np.sqrt(2)
     vertices = np.concatenate([square, [[0.0, 0.0, height]]]) + np.asarray(centre, dtype=np.float64)
@@ -65,7 +65,7 @@ def rod(start: ArrayLike, end: ArrayLike, radius: float) -> trimesh.Trimesh:
 def lathe(
     start: ArrayLike, axis: ArrayLike, profile: Sequence[tuple[float, float]], sections: int = 96
 ) -> trimesh.Trimesh:
-    """Build a solid of revolution; ``profile`` lists (distance along ``axis`` from ``start``, radius)."""
+    """Build a solid of revolution about ``axis``. ``profile`` lists (distance from ``start`` along it, radius)."""
     direction = np.asarray(axis, dtype=np.float64)
     direction = direction / np.linalg.norm(direction)
     side = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
@@ -102,7 +102,10 @@ def arc_tube(
 
 
 def _tube_mesh(path: NDArray, side: NDArray, across: NDArray, half: NDArray, sections: int) -> trimesh.Trimesh:
-    """Build a capped tube along ``path`` (n, 3); cross-sections lie in the planes of ``side`` and ``across``."""
+    """Build a tube with end caps along ``path`` (n, 3), with elliptic cross-sections of ``sections`` points.
+
+    ``half`` (n, 2) are the half axes along the unit vectors ``side`` (n, 3) and ``across`` (3,).
+    """
     turn = 2 * np.pi * np.arange(sections) / sections
     in_plane = (half[:, :1] * np.cos(turn))[..., None] * side[:, None]
     rings = path[:, None] + in_plane + (half[:, 1:] * np.sin(turn))[..., None] * across  # (n, sections, 3)
@@ -127,7 +130,10 @@ def merge_solid_meshes(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
 
 
 def solid_corner_normals(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
-    """Return (F, 3, 3) unit corner normals: angle-weighted means over adjacent faces within the crease angle."""
+    """Return (F, 3, 3) unit normals at the corners of the F triangles, for smooth shading.
+
+    A normal is the mean over adjacent faces within the crease angle (24 degrees), weighted by their corner angles.
+    """
     faces, flat = mesh.faces.view(np.ndarray), mesh.face_normals.view(np.ndarray)
     corners, angles = faces.size, mesh.face_angles.view(np.ndarray).ravel()
     places = (np.arange(corners), faces.ravel())
@@ -196,7 +202,7 @@ def build_solids() -> list[Solid]:
 
 
 def _place_solid(solid: Solid, pose: NDArray[np.float64]) -> Solid:
-    """Return the solid transformed by the (4, 4) similarity ``pose``; its pattern moves along."""
+    """Return the solid transformed by ``pose``, a (4, 4) similarity transform; its colour pattern moves with it."""
     mesh = solid.mesh.copy()
     mesh.apply_transform(pose)
     back = np.linalg.inv(pose).astype(np.float32)
@@ -272,7 +278,7 @@ def _wire_cube_solids() -> list[Solid]:
 
 
 def _pin_solids() -> list[Solid]:
-    """Build a row of ever thinner and taller pins with coloured heads."""
+    """Build a row of five pins with coloured heads; each pin is thinner and taller than the one before."""
     solids = []
     for i, colour in enumerate(("#e63946", "#ff9f1c", "#ffe14d", "#2ec4b6", "#7b2cbf")):
         foot = np.array([-0.66 + 0.155 * i, 0.64 - 0.02 * i, FLOOR])

@@ -1,4 +1,4 @@
-"""Generator of the scene ``solids``, in the NeRF-synthetic (Blender) layout.
+"""Generator of the scene ``solids``: images of solid bodies, in the NeRF-synthetic (Blender) file layout.
 
     transforms_train.json, transforms_test.json    camera_angle_x in radians, camera-to-world matrices with OpenGL axes
     train/r_0.png ..., test/r_0.png ...            RGBA, sRGB, straight alpha, transparent where nothing is hit
@@ -35,7 +35,8 @@ from neuprim.scenes.shading import encode_scene_srgb, scene_daylight_radiance
 from neuprim.scenes.shapes import build_solids
 
 Radiance = Callable[[Any, NDArray[np.float64], NDArray[np.float64]], tuple[NDArray[np.float32], NDArray[np.bool_]]]
-"""(scene, origins, directions) -> radiance and hits, as :func:`~neuprim.scenes.shading.scene_daylight_radiance`."""
+"""Function (scene, origins, directions) -> (radiance, hit mask), like
+:func:`~neuprim.scenes.shading.scene_daylight_radiance`."""
 
 GENERATOR_VERSION = 1  # part of the cache's key: raise it with every change to shapes, light, cameras or file layout
 
@@ -46,7 +47,7 @@ _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 @dataclass(frozen=True)
 class SolidsSettings:
-    """Settings of ``scene=solids``: image size in pixels, images per split, and n for n x n rays per pixel."""
+    """Settings of ``scene=solids``: image width and height in pixels, images per split, rays per pixel per axis."""
 
     size: ImageSize = 512
     train_views: Annotated[int, Range(1, 10000)] = 80
@@ -81,7 +82,10 @@ def describe_solids_images(
     seen: Radiance = scene_daylight_radiance,
     facts: Callable[[Any], Mapping[str, Any]] = lambda scene: {},
 ) -> SceneImageSet[_SolidsView]:
-    """Describe images of the scene from ``build``, with the cameras of ``scene=solids``; ``seen`` shades the rays."""
+    """Return the image set of the scene that ``build`` makes, with the cameras of ``scene=solids``.
+
+    ``seen`` shades rays. ``facts`` maps the scene to further fields of the transforms files.
+    """
 
     def views(split: str, count: int) -> list[_SolidsView]:
         return [_SolidsView(f"r_{i}", pose) for i, pose in enumerate(solids_camera_poses(split, count))]
@@ -119,7 +123,10 @@ def solids_camera_poses(split: str, count: int) -> list[NDArray[np.float64]]:
 def draw_solids(
     scene: Scene, pose: NDArray[np.float64], size: int, supersampling: int, seen: Radiance = scene_daylight_radiance
 ) -> NDArray[np.uint8]:
-    """Render (size, size, 4) uint8 sRGB with straight alpha. Rays are averaged in premultiplied linear light."""
+    """Render an image, (size, size, 4) uint8 sRGB with straight alpha. ``pose`` (4, 4) is camera to world, OpenGL axes.
+
+    The rays of a pixel are averaged in premultiplied linear light; ``seen`` shades them.
+    """
     bands = []
     for directions in scene_ray_bands(pose, FIELD_OF_VIEW, size, supersampling):
         rgb, hit = seen(scene, pose[:3, 3], directions)

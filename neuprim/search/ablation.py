@@ -1,7 +1,8 @@
 """Trade-offs of training settings: train a set of models, measure them together, and find the Pareto fronts.
 
 One model of the set, the *centre*, has the user's settings. The others differ from the centre in a single setting, or
-in a promising combination of settings. All models train for the same time. The same request continues an earlier set.
+in a promising combination of settings. All models train for the same time. Running the same request again continues an
+earlier set.
 """
 
 from __future__ import annotations
@@ -63,10 +64,12 @@ TRIALS = "trials"  # folder of the models
 __all__ = ["run_ablation"]
 
 _PACES, _TRAINING = 0.2, 0.5
-"""Fraction of the budget for measuring step times; fraction of the rest for training single changes."""
+"""Two fractions: of the time budget, for measuring the time per training step; of the rest, for training the models
+that change a single setting."""
 
 _SINGLES, _TIMES, _COMBINED = 0.58, 0.64, 0.88
-"""Fractions of the rest at which single changes are trained, single changes are timed, and combinations are trained."""
+"""Deadlines, as fractions of the time after planning: for training models with a single changed setting, for timing
+their frames, and for training models that combine changes."""
 
 _MAX_COMBINATIONS = 12
 
@@ -87,7 +90,7 @@ def run_ablation(
     The same call with a larger budget adds models.
 
     Args:
-        request: settings to vary, and the budget. Its ``words`` are overrides of ``neuprim run``.
+        request: settings to vary, and the budget. ``request.words`` are overrides (``key=value``) of ``neuprim run``.
         launcher: settings of the launcher that trains the models. This process measures them.
         tell: called with lines of text for the user.
         progress: called with (text, done fraction 0..1).
@@ -126,7 +129,10 @@ def run_ablation(
 
 @dataclass(frozen=True)
 class _AblationSet:
-    """A set of models to compare: its folder, overrides and configuration of the centre, and launcher settings."""
+    """A set of models to compare, and the settings of the launcher that trains them.
+
+    ``words`` and ``centre`` are the overrides and the configuration of the model with the user's settings.
+    """
 
     folder: Path
     words: list[str]
@@ -141,7 +147,7 @@ class _AblationSet:
 
 
 class _AblationSession(TradeoffSession):
-    """Train and measure the models of a set within the budget."""
+    """Session that trains and measures a set of models within a time budget."""
 
     def __init__(
         self,
@@ -171,11 +177,14 @@ class _AblationSession(TradeoffSession):
         return time.monotonic() - self.begun - self._compiling
 
     def seconds_left(self, part: float) -> float:
-        """Return the seconds left until the fraction ``part`` of the time after planning is used."""
+        """Return the seconds left until the fraction ``part`` (0..1) of the time budget after planning is used."""
         return self._planned_at + part * max(self.request.budget - self._planned_at, 0.0) - self.spent
 
     def run(self, wanted: Sequence[Variant]) -> None:
-        """Train models with single changes, then with combinations; find the Pareto fronts and write the results."""
+        """Train the ``wanted`` models, which change one setting each, then models that combine changes.
+
+        Then find the Pareto fronts and write the results.
+        """
         with limit_process_threads(self._threads):  # as many threads as a training has
             wanted = self._measure_step_times(wanted)
         alone = len({variant.knob for variant in wanted}) <= 2  # the centre and one knob: nothing to combine
@@ -202,7 +211,7 @@ class _AblationSession(TradeoffSession):
     # ------------------------------------------------------------ step times
 
     def _measure_step_times(self, wanted: Sequence[Variant]) -> list[Variant]:
-        """Measure the step times and plan how long to train; return the variants whose step time is known."""
+        """Measure the time per training step of variants and plan how long to train; return the measured variants."""
         kept, latest = list[Variant](), self.spent + _PACES * (self.request.budget - self.spent)
         paces = {CENTRE: 1.0} if self._plan is None else dict(self._plan.paces)
         for number, variant in enumerate(wanted):
@@ -225,7 +234,10 @@ class _AblationSession(TradeoffSession):
         return AblationStepTimes(self.centre, self._loaded[0])
 
     def _find_pace(self, variant: Variant, paces: dict[str, float]) -> str | None:
-        """Measure a variant's time per step and store it in ``paces``. Return why it cannot be trained, else None."""
+        """Measure a variant's time per training step, divided by the centre's, and store it in ``paces``.
+
+        Return why the variant cannot be trained; None if it can.
+        """
         if not variant.turned:
             paces[variant.name] = 1.0
         if variant.name in paces:
@@ -245,8 +257,10 @@ class _AblationSession(TradeoffSession):
     # ------------------------------------------------------------ training
 
     def _train(self, wanted: Sequence[Variant], part: float) -> None:
-        """Train and measure the variants that the record lacks, until the fraction ``part`` of the budget is used. The
-        centre and interrupted trainings are trained in any case.
+        """Train and measure the variants that are not in the record yet.
+
+        A variant is skipped if its training would end after the fraction ``part`` of the time after planning. The
+        centre (the model with the user's settings) and interrupted trainings are never skipped.
         """
         known = {(point.turned, point.length) for point in self.record.points}
         todo = [variant for variant in wanted if (variant.turned, variant.length) not in known]
@@ -319,7 +333,7 @@ class _AblationSession(TradeoffSession):
             point.centre_ms = statistics.median(self.record.points[0].ms)
 
     def _combinations(self) -> list[Variant]:
-        """Return the combined variants of earlier sessions, and as many new ones as there is time to train."""
+        """Return variants that combine several changes: those of earlier sessions, and new ones as time allows."""
         points = self.record.points
         allowed = [Variant(COMBINED, point.turned) for point in points if point.knob == COMBINED]
         rounds = self.seconds_left(_COMBINED) / max(self.plan.seconds, 1e-9)
@@ -346,7 +360,7 @@ def _compose_ablation_set(request: TradeoffRequest, launcher: LauncherSettings) 
 
 
 def _check_ablation_folder(models: _AblationSet, before: TradeoffRecord | None) -> None:
-    """Raise an error if the folder holds other files, or a set of models with another centre."""
+    """Raise an error if the folder holds unrelated files, or the models of another trade-off."""
     folder = models.folder
     if before is None:
         if folder.is_dir() and any(folder.iterdir()) and not (folder / TRIALS).is_dir():
@@ -361,7 +375,9 @@ def _check_ablation_folder(models: _AblationSet, before: TradeoffRecord | None) 
 def _resume_ablation_set(
     folder: Path, before: TradeoffRecord | None, identity: Mapping[str, Any], tell: Tell
 ) -> TradeoffRecord:
-    """Return the record to continue, with the points of ``before`` if they were measured under the same conditions."""
+    """Return the record to continue. It has the points (measured models) of the earlier record ``before``, if the facts
+    in ``identity`` (configuration, views, machine, versions) have not changed.
+    """
     record = TradeoffRecord(dict(identity))
     if before is None:
         return record

@@ -1,4 +1,7 @@
-"""Plan an ablation: the variants of a model, how long to train each, and which changes to combine."""
+"""Plan an ablation, i.e. trainings that each change one setting of the user's model (the *centre*).
+
+The plan says which variants to train, how long to train each, and which changes to combine.
+"""
 
 from __future__ import annotations
 
@@ -25,18 +28,19 @@ CENTRE = "centre"  # name of the model that others are compared with
 LENGTH = "train.iterations"  # the knob whose values are shares of the full length
 
 _COUNTS, _LENGTHS = (0.5, 2.0, 0.25, 4.0, 1 / 8, 1 / 16, 1 / 32, 1 / 64), (0.5, 0.25)
-"""Factors on the centre's number of primitives and training length, for every task."""
+"""Factors by which variants change the number of primitives, and the training length, of the user's model."""
 
 _MIN_LENGTH, _MIN_STEPS = 1 / 20, 100
-"""Shortest training of the centre: a fraction of its steps, or a number of steps if its budget is in seconds."""
+"""Least training of the user's model in an ablation: a fraction of the configured steps, or a number of steps if the
+configured budget is in seconds."""
 
 _STEPS_PER_TURN, _TURNS = 4, 6  # step times: variant and centre alternate, so that load of the machine affects both
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A model to train: the setting that it changes (``knob``), its overrides on top of the centre's (``turned``), and
-    its training length as a fraction of the full length.
+    """A model to train in an ablation. ``knob`` is the name of the changed setting, and ``turned`` the overrides
+    (``key=value``) on top of the user's. ``length`` is the training length as a fraction of the full length.
     """
 
     knob: str
@@ -54,12 +58,15 @@ class Variant:
 
     @property
     def label(self) -> tuple[str, ...]:
-        """Overrides and training length, which name the variant in the list of points that were not measured."""
+        """Overrides and training length as texts. They name the variant in the list of models without measurements."""
         return (*self.turned, *((f"{self.length:g} of the length",) if self.length != 1.0 else ()))
 
 
 def list_variants(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]:
-    """Return setting -> variants that change only this setting, the values closest to the centre's first."""
+    """Return a dict: setting name -> variants that change only this setting.
+
+    The variants with values close to the value in ``centre`` come first.
+    """
     counts = dict.fromkeys(max(1, round(part * centre.model.count)) for part in _COUNTS)
     knob = "model.primitives"
     variants = {knob: [Variant(knob, (quote_override(knob, n),)) for n in counts if n != centre.model.count]}
@@ -74,20 +81,20 @@ def list_variants(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]
 
 
 def merge_variant_overrides(words: Sequence[str], over: Sequence[str]) -> list[str]:
-    """Return the overrides ``words``, without those whose keys are in ``over``, followed by ``over``."""
+    """Return the overrides ``words`` followed by ``over``. Those in ``words`` that ``over`` sets again are dropped."""
     again = {assignment.key for assignment in parse_overrides(over)}
     return [*(a.text for a in parse_overrides(words) if a.key not in again), *over]
 
 
 @dataclass
 class AblationPlan:
-    """How long each model of an ablation trains; a continued ablation uses the same plan.
+    """Training lengths of the models of an ablation. A continued ablation uses the same plan.
 
     Attributes:
-        steps: training steps of the centre in this ablation.
+        steps: training steps of the centre (the model with the user's settings) in this ablation.
         seconds: approximate time of a training of full length.
-        whole: training steps in the centre's configuration; 0 if its budget is in seconds.
-        paces: name of a variant -> its seconds per step, divided by those of the centre.
+        whole: training steps in the centre's configuration; 0 if the configured budget is in seconds.
+        paces: name of a variant -> seconds per training step, divided by those of the centre.
     """
 
     steps: Annotated[int, Range(at_least=1)]
@@ -96,8 +103,9 @@ class AblationPlan:
     paces: dict[str, Annotated[float, Range(above=0)]] = field(default_factory=lambda: {CENTRE: 1.0})
 
     def overrides(self, variant: Variant, words: Sequence[str], centre: RunConfig) -> list[str]:
-        """Return the overrides that train a variant for its planned length. Population control intervenes as often as
-        in a run of the centre's configuration.
+        """Return the overrides that train a variant for its planned length.
+
+        Population control (which adds and moves primitives) runs as many times as in a full run of ``centre``.
         """
         steps = max(1, round(self.steps * variant.length / self.paces[variant.name]))
         budget = [quote_override(LENGTH, steps)] + ["train.max_seconds=null"] * (centre.train.max_seconds is not None)
@@ -115,10 +123,10 @@ class AblationPlan:
 
 
 def plan_training_lengths(centre: RunConfig, pace: float, available: float, lengths: Sequence[float]) -> AblationPlan:
-    """Return the plan with which all trainings fit into the available seconds.
+    """Return a plan in which all trainings fit into ``available`` seconds, unless they would become too short.
 
     Args:
-        pace: seconds per step of the centre.
+        pace: seconds per training step of the centre (the model with the user's settings).
         lengths: length of each training, as a fraction of the full length.
     """
     if centre.train.iterations is None:
@@ -132,11 +140,12 @@ def plan_training_lengths(centre: RunConfig, pace: float, available: float, leng
 
 
 class AblationStepTimes:
-    """Measure the time per training step of variants, relative to the centre. The steps are those halfway through the
-    training, where all colour bands are in use.
+    """Timer of the training steps of variants, relative to the centre (the model with the user's settings).
+
+    The timed steps are those halfway through the training, where all bands of spherical harmonics are in use.
 
     Attributes:
-        seconds: seconds per step of the centre.
+        seconds: seconds per training step of the centre.
         compiling: seconds that kernels took to compile.
     """
 
@@ -166,7 +175,7 @@ class AblationStepTimes:
         return trainer
 
     def _run_turns(self, trainer: Trainer) -> tuple[float, float]:
-        """Run equally many steps of a trainer and of the centre, in alternating turns; return the seconds of each."""
+        """Run the same number of training steps of ``trainer`` and of the centre, alternately; return both times, s."""
         total = [0.0, 0.0]
         with use_one_torch_thread_for_run():
             for turn in range(_TURNS + 1):
@@ -185,7 +194,9 @@ def _ablation_model_identity(trainer: Trainer) -> tuple[Any, ...]:
 
 
 def combine_ablation_changes(points: Sequence[TradeoffPoint], most: int) -> list[tuple[str, ...]]:
-    """Return at most ``most`` combinations of measured single changes that save bytes, save time or improve quality."""
+    """Return at most ``most`` combinations of overrides. They combine changes of single settings that, as measured in
+    ``points``, save bytes, save time or improve quality.
+    """
     centre = points[0]
     smaller, faster, better = [], [], []
     for point in points[1:]:

@@ -45,7 +45,7 @@ _FIRST_LOSS = 2.0  # loss by rounding before the first round of training, in uni
 _ROUND_STEPS, _MAX_ROUNDS = 500, 3  # least steps of a round, and most rounds; each shows how much training recovers
 
 _SLOPE, _AIM = 0.7, 0.95
-"""dB lost after fine-tuning per dB lost before it; fraction of the tolerance that the next round aims at."""
+"""dB lost after fine-tuning per dB lost before it; fraction of the tolerance that a round should use."""
 
 _MAX_TRIES = 16
 
@@ -188,7 +188,7 @@ def _search_quantized_model(
 
 
 class TrainingData(NamedTuple):
-    """What fine-tuning needs: configuration, task and data set."""
+    """Input of fine-tuning: configuration of the run, task and data set."""
 
     config: RunConfig
     task: TaskSpec
@@ -196,7 +196,7 @@ class TrainingData(NamedTuple):
 
 
 class QuantizedModel(NamedTuple):
-    """A model in canonical order, its quantizers, its number of fine-tuning steps, and notes for the user."""
+    """A model in the canonical form that files store, its quantizers, number of training steps, and notes to print."""
 
     model: Primitives
     quantizers: Quantizers
@@ -205,14 +205,16 @@ class QuantizedModel(NamedTuple):
 
 
 def dequantize(model: Primitives, quantizers: Quantizers) -> Primitives:
-    """Return a copy of a model, given in canonical order, with parameters rounded as in a compressed file."""
+    """Return a copy of a model in canonical form (:func:`canonical_model`), with parameters rounded as in a file."""
     params = {name: value.detach() for name, value in fake_quantize(model.params, quantizers).items()}
     return Primitives(model.density, model.colour, params)
 
 
 class QuantizationSearch:
-    """Search for quantizers by one number, the *error share*: the squared error that rounding may add to images, over
-    the squared error without rounding. A search begins at the share ``start``.
+    """Search for the quantizers of a model, which round its parameters. One number, the *error share*, sets them all.
+
+    The error share is the squared error that rounding may add to images, divided by the squared error without rounding.
+    Methods begin their search at the share ``start``.
     """
 
     def __init__(self, model: Primitives, dataset: Dataset, quality: SearchQuality) -> None:
@@ -226,7 +228,7 @@ class QuantizationSearch:
         self._error = 10 ** (-quality.image_quality(self.model) / 10) / max(columns, 1)
 
     def with_model(self, trained: Primitives) -> QuantizationSearch:
-        """Return a search for the fine-tuned model ``trained``, with the error estimates of this search."""
+        """Return a search for the fine-tuned model ``trained`` that uses the error estimates of this search."""
         other = copy(self)
         other.model = trained
         return other
@@ -235,17 +237,26 @@ class QuantizationSearch:
         return fit_quantizers_to_error(self.model, self._effects, share * self._error)
 
     def find_coarsest(self, accept: Callable[[Quantizers], bool], start: float) -> tuple[Quantizers, float]:
-        """Return the coarsest quantizers that ``accept`` accepts, else the finest possible; and their error share."""
+        """Return (quantizers, their error share): the coarsest that ``accept`` accepts, else the finest possible.
+
+        ``start`` is the first error share to try.
+        """
         fine, _ = self._bisect(accept, start)
         return self.fit(fine), fine
 
     def find_finest(self, accept: Callable[[Quantizers], bool], start: float) -> tuple[Quantizers, float]:
-        """Return the finest quantizers that ``accept`` accepts, else the coarsest possible; and their error share."""
+        """Return (quantizers, their error share): the finest that ``accept`` accepts, else the coarsest possible.
+
+        ``start`` is the first error share to try.
+        """
         _, coarse = self._bisect(lambda quantizers: not accept(quantizers), start)
         return self.fit(coarse), coarse
 
     def _bisect(self, is_fine: Callable[[Quantizers], bool], start: float) -> tuple[float, float]:
-        """Return two close error shares: the first is fine enough, the second is not. At a limit, both are equal."""
+        """Return two close error shares: ``is_fine`` is true for the first and false for the second.
+
+        At a limit, both shares are equal.
+        """
         fine, coarse, share = 0.0, 0.0, start
         for _ in range(_MAX_TRIES):
             if is_fine(self.fit(share)):
@@ -264,8 +275,9 @@ class QuantizationSearch:
 def finetune_for_table(
     data: TrainingData, model: Primitives, table: BitTable, steps: int, progress: Progress
 ) -> QuantizedModel:
-    """Quantize a model with the bits in ``table``, after fine-tuning. If that does not improve the training views,
-    quantize the original model.
+    """Fine-tune a model for ``steps`` steps, and quantize it with the bits in ``table``.
+
+    If the fine-tuned model does not render the training views better, quantize the original model.
     """
     whole = canonical_model(model)
     quantizers, quality = fit_quantizers(whole, table), SearchQuality.of_run(data.config, data.dataset)
@@ -322,12 +334,12 @@ def search_fewest_bits(
 
 
 def _tolerated_error_share(decibels: float) -> float:
-    """Return the relative increase of the squared error that lowers the PSNR by this many dB."""
+    """Return the error share (increase of the squared error, relative) that lowers the PSNR by this many dB."""
     return float(min(max(10 ** (decibels / 10) - 1, _FINEST), _COARSEST))
 
 
 def _finetune(data: TrainingData, model: Primitives, quantizers: Quantizers, steps: int) -> Primitives:
-    """Fine-tune a model in canonical order; every image is rendered from quantized parameters."""
+    """Fine-tune a model in canonical form (:func:`canonical_model`). Images are rendered from quantized parameters."""
     trainer = make_run_finetune_trainer(Job(data.config, data.task), data.dataset, model, steps)
     trainer.zero_masks = mask_pruned_numbers(trainer.model)
     on_device = {name: quantizer.to(trainer.device) for name, quantizer in quantizers.items()}

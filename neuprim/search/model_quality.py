@@ -28,7 +28,10 @@ MAX_PSNR = 200.0  # dB that stand for equal images, as JSON has no infinity
 
 @dataclass(frozen=True)
 class EvalView:
-    """A test view, its (H, W, C) ground truth over the background, and a mask of valid pixels (None: all are valid)."""
+    """A test view, its (H, W, C) ground truth composited over the background, and an (H, W) mask of valid pixels.
+
+    The mask is None if all pixels are valid.
+    """
 
     view: View
     image: Tensor
@@ -54,14 +57,14 @@ def choose_trial_views(dataset: Dataset, views: int) -> list[EvalView]:
 
 
 def fill_masked(image: Tensor, view: EvalView) -> Tensor:
-    """Return ``image`` with the ground truth in the pixels outside the view's mask."""
+    """Return ``image``, with the pixels outside the view's mask replaced by the ground truth."""
     return image if view.mask is None else torch.where(view.mask[..., None], image, view.image.to(image))
 
 
 def measure_trial_views(
     model: Primitives, views: Sequence[EvalView], settings: RenderSettings, background: Tensor
 ) -> EvalQuality:
-    """Render all views and compare the images with the ground truth."""
+    """Render all views with a model; return the mean quality against the ground truth, and the render time."""
     render_image(model, views[0].view, settings, background)  # the first frame loads and compiles
     rows, seconds = [], []
     for one in views:
@@ -80,21 +83,21 @@ _VIEWS, _QUICK_VIEWS = 24, 8  # views that decide, and how many of them intermed
 _SENSITIVITY_VIEWS = 160  # views for sensitivities, at most; primitives of a short time or a corner are in few views
 
 _FRAMES, _QUICK_FRAMES, _POINTS = 64, 8, 4096
-"""Frames with known extinction, how many of them intermediate evaluations use, and points per frame."""
+"""Frames in which the extinction is compared with voxels, at most; frames of quick evaluations; points per frame."""
 
 _DRAWS_PER_FRAME = 6  # number of draws over that of frames; each draw is of a random frame, and these find most
 
 
 class SearchQuality:
-    """Quality measure of a search: mean PSNR of training views, and for a run trained on voxels the error of the
-    extinction.
+    """Quality measure that a search maximises: the mean PSNR of training views. For a run trained on voxels, the error
+    of the extinction inside the volume counts, too.
 
     Views are chosen at random, because training views are often ordered by camera or time.
 
     Attributes:
         views: indices of the training views whose PSNR is measured.
         others: indices of other training views, used to estimate the effect of parameters on images.
-        draws: points with known extinction; empty unless the run was trained on voxels.
+        draws: points with known extinction, one sample per frame; empty unless the run was trained on voxels.
     """
 
     def __init__(self, dataset: Dataset, settings: RenderSettings, inside: bool = False) -> None:
@@ -111,9 +114,9 @@ class SearchQuality:
         return cls(dataset, config.renderer, config.train.supervision != "images")
 
     def __call__(self, model: Primitives, quick: bool = False) -> float:
-        """Return a model's quality in dB: the PSNR of images, or less if the extinction lost more dB than the images.
+        """Return a model's quality in dB: the PSNR of images, or less if the extinction has lost more dB than them.
 
-        Losses are relative to the first model that was evaluated.
+        Losses are relative to the first model that this object evaluated.
 
         Args:
             quick: evaluate fewer views and frames.
@@ -137,7 +140,7 @@ class SearchQuality:
         return float(np.mean(values))
 
     def inside_quality(self, model: Primitives, quick: bool = False) -> float:
-        """Return the PSNR of the extinction relative to its scale, dB, averaged over frames."""
+        """Return the mean PSNR of the extinction over frames, dB. The peak is a frame's typical extinction."""
         values = []
         with torch.no_grad():
             for samples in self.draws[:: max(len(self.draws) // _QUICK_FRAMES, 1) if quick else 1]:
@@ -149,12 +152,12 @@ class SearchQuality:
         return float(np.mean(values))
 
     def inside_weight(self, model: Primitives) -> float:
-        """Return the weight of extinction errors: squared error of images over squared error of the extinction."""
+        """Return the factor by which squared errors of the extinction become as large as those of images."""
         return 10 ** ((self.inside_quality(model) - self.image_quality(model)) / 10)
 
 
 def _draw_search_quality_points(points: PointSupervision) -> list[PointSamples]:
-    """Draw points with known extinction in different frames, sorted by the frames' names."""
+    """Return samples of points with known extinction, one per frame, for at most 64 frames sorted by name."""
     generator, frames = torch.Generator().manual_seed(0), dict[str, PointSamples]()
     for _ in range(_DRAWS_PER_FRAME * _FRAMES):
         samples = points.draw(_POINTS, generator)

@@ -1,5 +1,7 @@
-"""``neuprim prune``: remove parameters of a finished run (a *cut*), fine-tune, evaluate, and undo cuts that are too
-large."""
+"""``neuprim prune``: make the model of a finished run smaller, in rounds.
+
+A round removes parameters (a *cut*), fine-tunes and evaluates the model. Cuts that lose too much quality are undone.
+"""
 
 from __future__ import annotations
 
@@ -34,18 +36,20 @@ from neuprim.search.pruning_cuts import (
 )
 
 MAX_ROUNDS, _LONG_ROUND, _MIN_ROUND = 3, 1300, 600
-"""Largest number of rounds, unless a round would have more than this number of steps; least steps of a round. Every
-round ends at the learning rates of the run's end, so that the models to evaluate are trained equally well."""
+"""Largest number of rounds; steps of a round above which there are more rounds; least steps of a round. Every round
+ends with the final learning rates of the run, so that evaluated models are trained equally well."""
 
 __all__ = ["PruneRequest", "Pruning", "prune_run"]
 
 _PATIENCE = 2.0  # a model that lost at most this many tolerances gets another round before its cut is undone
 
 _FIRST_CUT, _GROWTH, _LARGEST_CUT = 6.5, 1.5, 10.0
-"""Loss of the first cut over the tolerance; growth of the next cut; dB up to which a cut without effect is doubled."""
+"""Intended loss of the first cut, divided by the tolerance; largest factor from one cut to the next; and dB up to which
+a cut that removes nothing is doubled."""
 
 _REMAINING, _BROUGHT = 0.3, 0.35
-"""Fraction of a cut's loss that remains after a round; fraction of a round's gain that the next round repeats."""
+"""Expected fraction of a cut's loss that remains after fine-tuning; fraction of a round's gain beyond this that is also
+expected of the next round."""
 
 _ENOUGH, _FREE = 0.1, 0.02
 """Fractions of the tolerance: cuts end when less than the first is left; losses below the second are ignored."""
@@ -57,11 +61,11 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class PruningStage:
-    """One round of pruning, with all reductions of fields so far (``words``).
+    """Result of one round of pruning. ``words`` has all reductions of fields so far, e.g. "colour.degree=1".
 
     Attributes:
         primitives, numbers: how many primitives, and how many parameter values, remain.
-        cut, trained: quality in dB after the round's cut, and after the fine-tuning that follows the cut.
+        cut, trained: quality in dB after the cut (removal of parameters), and after the fine-tuning that follows.
         kept: whether the loss is within the tolerance.
     """
 
@@ -75,10 +79,10 @@ class PruningStage:
 
 @dataclass(frozen=True)
 class _PruningState:
-    """Intermediate model of pruning, with all reductions of its fields so far (``words``).
+    """Intermediate model of pruning. ``words`` has all reductions of its fields so far, e.g. "colour.degree=1".
 
     Attributes:
-        bite: loss in dB that the last cut was intended to cause, before fine-tuning.
+        bite: loss in dB that the last cut (removal of parameters) was intended to cause, before fine-tuning.
         cut: quality after the last cut, before fine-tuning, dB.
         lost: loss relative to the full model, dB.
         rounds: rounds of fine-tuning since the last cut.
@@ -99,9 +103,9 @@ class _PruningState:
 
 
 def _saved_share(model: Primitives, smaller: Primitives, numbers: int) -> float:
-    """Return the fraction of parameter values that ``smaller`` saves: in the file or per primitive, the larger one.
+    """Return the fraction of parameter values that ``smaller`` saves, compared with ``model``.
 
-    ``numbers`` is the count of values in the file of ``model``.
+    It is the larger of two fractions: in the file, where ``model`` has ``numbers`` values, and per primitive.
     """
     per_primitive = smaller.parameters_per_primitive / model.parameters_per_primitive
     return max(1 - count_unpruned_numbers(smaller) / numbers, 1 - per_primitive)
@@ -131,7 +135,7 @@ class ModelShrinker:
         self.quality, self._sensitivity_seed = SearchQuality.of_run(self.config, self.dataset), 0
 
     def shrink(self, model: Primitives) -> tuple[Primitives, tuple[str, ...]]:
-        """Return the smallest model found, and the reductions of its fields as overrides."""
+        """Prune ``model``; return the smallest model found, and the reductions of its fields as overrides."""
         self.base = self.quality(model)
         best, tried = _PruningState(model), None
         untried: tuple[str, ...] = ()
@@ -169,7 +173,7 @@ class ModelShrinker:
     def _next_state(
         self, best: _PruningState, untried: tuple[str, ...], bite: float, progress: float
     ) -> _PruningState | None:
-        """Return the model to fine-tune next, usually after a cut; None if nothing more can be removed."""
+        """Return the model to fine-tune next, usually after removing parameters; None if no more can be removed."""
         if untried:  # reductions that failed together with other cuts are tried alone
             return self._reduce_fields(best, untried, bite)
         left = self.tolerance - max(best.lost, 0.0)
@@ -181,13 +185,16 @@ class ModelShrinker:
         return None if state.numbers >= best.numbers else state
 
     def _max_loss(self, before: _PruningState, now: _PruningState, best: _PruningState) -> float:
-        """Return the loss in dB above which a round's cut is undone, because another round would not recover it."""
+        """Return the loss in dB above which a cut is undone, because another round of fine-tuning would not recover it.
+
+        ``before`` and ``now`` are the states before and after the last round, ``best`` is the best one so far.
+        """
         if best.rounds and best.lost < 0:  # the model before has room, so a smaller cut saves something
             return self.tolerance
         return self.tolerance * _PATIENCE if now.rounds == 1 else self.tolerance + before.lost - now.lost
 
     def _cut(self, state: _PruningState, bite: float, progress: float) -> _PruningState:
-        """Return the model after a cut that loses about ``bite`` dB before fine-tuning."""
+        """Return the model after removing parameters (a cut), which loses about ``bite`` dB before fine-tuning."""
 
         def quick(model: Primitives) -> float:
             return self.quality(model, quick=bool(self.steps))
@@ -228,7 +235,7 @@ class ModelShrinker:
         return cut_to_loss(model, price_cuts(model, views, inside, self.quality), quality, loss)
 
     def _train(self, state: _PruningState, number: int, rounds: int) -> _PruningState:
-        """Return the model after round ``number`` of fine-tuning."""
+        """Fine-tune the model in round ``number`` of ``rounds``; return the new state with its loss."""
         model, steps = state.model, self.steps * (number + 1) // rounds - self.steps * number // rounds
         if steps and model.count:
             trainer = make_run_finetune_trainer(Job(self.config, self.task), self.dataset, model, steps)
@@ -357,7 +364,10 @@ def _measure_pruned(
 def _fit_pruned(
     config: RunConfig, task: TaskSpec, dataset: Dataset, model: Primitives, words: tuple[str, ...]
 ) -> Fitted:
-    """Return a pruned model as a trained run, with overrides that build such a model."""
+    """Return a pruned model as a finished training that can be saved and evaluated.
+
+    Its configuration has overrides that build such a model; ``words`` are the reductions of fields by pruning.
+    """
     reduced = [*config.model.reduced, *words]
     own = [f"model.primitives={model.count}"]
     own += [f"model.reduced=[{','.join(map(repr, reduced))}]"] if reduced else []

@@ -1,4 +1,7 @@
-"""Choose what pruning removes: the primitives, units and parts of fields with the least effect on images per value."""
+"""Choose what pruning removes: the parts of a model with the least effect on images per parameter value.
+
+Parts are primitives, units (e.g. a neuron in one primitive), and settings of whole fields (e.g. the highest degree).
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from neuprim.core.train.sensitivity import Sensitivity
 from neuprim.search.model_quality import SearchQuality
 
 _CONTRAST = 0.05
-"""Mean squared difference of a primitive's colour from its background, if :func:`price_cuts` cannot measure it."""
+"""Assumed mean squared difference between a primitive's colour and the colour behind it, if it cannot be measured."""
 
 _PROBE = 0.02  # share of the primitives whose removal measures the contrast
 
@@ -28,7 +31,7 @@ def _units(model: Primitives) -> dict[str, PrunableUnit]:
 
 
 def count_unpruned_numbers(model: Primitives) -> int:
-    """Return how many parameter values a file of the model stores: all except those of units that are zero."""
+    """Return how many parameter values a file of the model stores: all except units (e.g. neurons) that are zero."""
     zeros = sum(
         count_unit_numbers(unit, model.params) * int((~primitives_with_unit(unit, model.params)).sum())
         for unit in _units(model).values()
@@ -49,7 +52,10 @@ def mask_pruned_numbers(model: Primitives) -> dict[str, Tensor]:
 
 
 def list_pruning_reductions(model: Primitives) -> list[tuple[str, str, int]]:
-    """Return all reductions of fields as ("density" or "colour", setting, smaller value), the largest saving first."""
+    """Return all reductions of the fields as (field, setting, smaller value), e.g. ("colour", "degree", 1).
+
+    The reduction that saves most parameters is first.
+    """
     fields = (("density", model.density), ("colour", model.colour))
     words = [
         (kind, name, value) for kind, own in fields for name, values in own.reductions().items() for value in values
@@ -60,15 +66,20 @@ def list_pruning_reductions(model: Primitives) -> list[tuple[str, str, int]]:
 def price_cuts(
     model: Primitives, views: Sensitivity, inside: Sensitivity | None, quality: SearchQuality
 ) -> Sensitivity:
-    """Return the effect of removing each primitive and each unit: the mean squared change of images, from ``views``,
-    plus the weighted change of the extinction, from ``inside``. Without ``inside``, only images count.
+    """Return the effect of removing each primitive and each unit (e.g. a neuron in one primitive).
+
+    The effect is the mean squared change of images, estimated in ``views``. With ``inside``, the weighted squared
+    change of the extinction is added.
     """
     priced = replace(views, whole=views.whole * _measure_contrast(model, views, quality))
     return priced if inside is None else priced.combine(inside, quality.inside_weight(model))
 
 
 def _measure_contrast(model: Primitives, effects: Sensitivity, quality: SearchQuality) -> float:
-    """Measure the mean squared difference between primitives' colours and the colours behind, by removing a few."""
+    """Return the mean squared difference between primitives' colours and the colours behind them.
+
+    It is measured by removing a few primitives with the least effect.
+    """
     count = max(int(_PROBE * model.count), 1)
     order = effects.whole.where(effects.seen > 0, torch.inf).argsort(stable=True)
     kept = order[count:].sort().values
@@ -82,9 +93,10 @@ def _measure_contrast(model: Primitives, effects: Sensitivity, quality: SearchQu
 
 
 class _Sizes(NamedTuple):
-    """Parameter values that can be removed: ``whole`` (N,) has the number of nonzero values of each primitive.
-    ``present`` maps the name of a unit to an (N,) bool mask of the primitives that have the unit, and ``units`` maps it
-    to the unit's number of values in one primitive.
+    """Numbers of parameter values that pruning can remove from N primitives.
+
+    ``whole`` (N,) has the number of values of each primitive, without removed units. ``present`` maps the name of a
+    unit to an (N,) bool mask of the primitives that have the unit. ``units`` maps it to its values per primitive.
     """
 
     whole: Tensor
@@ -95,7 +107,7 @@ class _Sizes(NamedTuple):
 def cut_to_loss(
     model: Primitives, prices: Sensitivity, quality: Callable[[Primitives], float], loss: float
 ) -> Primitives:
-    """Remove the primitives and units with the least effect per value, as long as the loss is at most ``loss`` dB.
+    """Return a model without the primitives and units of least effect per value; it loses at most ``loss`` dB.
 
     Args:
         prices: effect of every primitive and unit on images, see :func:`price_cuts`.

@@ -46,7 +46,7 @@ from neuprim.search.tradeoff_record import (
 )
 
 _IMAGES, _TIMES, _COMBINED = 0.45, 0.65, 0.85
-"""Fractions of the budget at which images and times of single changes, and combinations should be done."""
+"""Deadlines, as fractions of the time budget: for images of single changes, their frame times, and combinations."""
 
 __all__ = ["measure_tradeoff"]
 
@@ -69,8 +69,8 @@ _VALUES: dict[str, tuple[Any, ...]] = {
 
 
 def list_render_knobs(reference: RenderConfig, model: Primitives) -> dict[str, list[RenderConfig]]:
-    """Return setting -> render configurations that change only this setting. The settings ``density.NAME`` and
-    ``colour.NAME`` reduce a field.
+    """Return a dict: setting -> render configurations that change only this setting of ``reference``. The settings
+    ``density.NAME`` and ``colour.NAME`` reduce the setting NAME of the model's field, e.g. ``colour.degree``.
     """
     cores, compared = core_count(), [name for name in backends.backend_names() if name != backends.REFERENCE]
     threads = sorted({1, 0, *(2**k for k in range(1, 7) if 2**k < cores)}) if cores > 1 else []
@@ -123,7 +123,7 @@ def measure_tradeoff(
 
 
 class _RenderTradeoffSession(TradeoffSession):
-    """Measure render configurations of one run within the budget."""
+    """Session that measures render configurations of one finished run within a time budget."""
 
     def __init__(
         self, folder: Path, request: TradeoffRequest, record: TradeoffRecord, progress: Progress, setup: TradeoffSetup
@@ -135,7 +135,10 @@ class _RenderTradeoffSession(TradeoffSession):
         return self.setup, self.setup.parse(self.record.points[number].words)
 
     def single_changes(self, knobs: Mapping[str, list[RenderConfig]]) -> Iterator[tuple[str, RenderConfig]]:
-        """Yield (setting, configuration) of each change that this machine can render; record the others as left out."""
+        """Yield (setting, configuration) for each change of a single setting that this machine can render.
+
+        The record notes the others as left out.
+        """
         base = self.setup.backend(self.setup.reference).name
         for name, configs in self.choose_knobs(knobs).items():
             for config in configs:
@@ -146,7 +149,10 @@ class _RenderTradeoffSession(TradeoffSession):
                     yield name, config
 
     def measure(self, wanted: Sequence[tuple[str, RenderConfig]], part: float) -> None:
-        """Measure quality and bytes of configurations that the record lacks, until ``part`` of the budget is used."""
+        """Measure quality and bytes of the ``wanted`` (setting, configuration) pairs that the record lacks.
+
+        End when the fraction ``part`` of the time budget is used.
+        """
         for number, (knob, config) in enumerate(wanted):
             words, points = self.setup.overrides(config), self.record.points
             if any(point.words == words for point in points):
@@ -164,7 +170,7 @@ class _RenderTradeoffSession(TradeoffSession):
         return config.settings == reference.settings and config.resolution == reference.resolution
 
     def combinations(self) -> list[RenderConfig]:
-        """Return earlier and new combinations of single changes that reduce time or bytes."""
+        """Return render configurations that combine single changes which reduce time or bytes: earlier and new ones."""
         base, *others = self.record.points
         faster, smaller, known = [], [], []
         for point in others:
@@ -200,7 +206,7 @@ def _render_tradeoff_identity(setup: TradeoffSetup) -> dict[str, Any]:
 
 
 def _resume_tradeoff_record(path: Path, identity: dict[str, Any], tell: Tell) -> TradeoffRecord:
-    """Return the earlier record if its facts equal ``identity``, else an empty record."""
+    """Return the record in ``path`` if its facts (e.g. model, settings) equal ``identity``, else an empty record."""
     before = read_tradeoff_record(path)
     if before is None:
         return TradeoffRecord(identity)

@@ -1,8 +1,8 @@
 """Predict quality, bytes and time of full runs from short trials, and propose the number of primitives to try next.
 
-Every doubling of the steps is assumed to gain a fixed fraction of the previous doubling's gain, and so is every
-doubling of primitives beyond the sizes tried. Predictions are off by about 0.6 dB over two doublings, so full runs
-check them. A *margin* is the predicted quality minus the target, in dB.
+Each doubling of the training steps is assumed to gain a fixed fraction of the gain by the previous doubling. The same
+holds for doublings of the number of primitives beyond the numbers tried. Predictions are off by about 0.6 dB over two
+doublings, so full runs check them. A *margin* is the predicted quality minus the target, in dB.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from neuprim.config.command_settings import SearchTarget
 from neuprim.search.target_record import Attempt, Purpose, SettingChange, TargetRecord, forecast_time
 
 ALLOWANCE, MIN_MARGIN = 0.1, 0.05
-"""Margin above the target, dB, that full runs aim at, and least margin: quantization loses about as much."""
+"""Margin above the target quality that full runs aim at, and least margin, dB. Quantization loses about as much."""
 
 _FULL_FILE = 0.97  # share of the allowed bytes to plan with
 
 _STEP_RATIO, _MIN_RATIO, _MAX_RATIO = 0.75, 0.5, 1.0
-"""Gain of a doubling of steps divided by the gain of the previous one: usual, least and largest measured value."""
+"""dB gained by a doubling of training steps, over those of the previous doubling: usual, least and largest value."""
 
 _SIZE_RATIO = 0.65  # gain of a doubling of primitives over that of the doubling before, beyond the sizes tried
 _FIRST_GAIN, _FIRST_SLOPE = 1.3, 1.0  # dB that a doubling of steps, and of primitives, gains where nothing is known
 _SEED_NOISE = 0.1  # dB between two seeds of one configuration
 
 _FURTHEST, _APART, _CLOSE = 3.0, 0.5, 0.3
-"""Doublings from the sizes tried to the next, at most; between two sizes that give a slope, at least; and between two
-sizes of which the second gives no new information."""
+"""Distances between numbers of primitives, in doublings: the largest from a tried number to the next; the least between
+two numbers that give a slope; and the largest at which a second number gives no new information."""
 
 
 class Forecast(NamedTuple):
@@ -41,12 +41,15 @@ class Forecast(NamedTuple):
 
 
 def to_forecast_decibels(name: str, value: float) -> float:
-    """Return PSNR unchanged, and SSIM as -10 log10(1 - ssim); on this scale equal gains need about equal effort."""
+    """Convert a quality measure to dB: PSNR is unchanged, SSIM becomes -10 log10(1 - ssim).
+
+    On this scale, equal gains need about equal effort.
+    """
     return value if name == "psnr" else -10 * math.log10(max(1.0 - value, 1e-6))
 
 
 def from_forecast_decibels(name: str, value: float) -> float:
-    """Invert :func:`to_forecast_decibels`."""
+    """Convert decibels to the measure ``name``, PSNR or SSIM; inverse of :func:`to_forecast_decibels`."""
     return value if name == "psnr" else 1.0 - 10 ** (-value / 10)
 
 
@@ -71,7 +74,10 @@ def forecast_quality(lengths: Mapping[int, float], steps: float, gain: float = _
 
 
 def _sum_forecast_gains(gain: float, ratio: float, doublings: float) -> float:
-    """Return gain * (ratio + ratio^2 + ...) with ``doublings`` terms, which need not be a whole number."""
+    """Return the gain of the next ``doublings``, if each gains ``ratio`` times as much as the previous one.
+
+    The sum gain * (ratio + ratio^2 + ...) has ``doublings`` terms, also for a fractional number.
+    """
     return gain * doublings if ratio == 1 else gain * ratio * (1 - ratio**doublings) / (1 - ratio)
 
 
@@ -87,13 +93,16 @@ def _bisect_count(low: float, high: float, is_low: Callable[[float], bool]) -> t
 
 @dataclass(frozen=True)
 class SizeCurve:
-    """Curve of the margin (predicted quality minus target, dB) over log2 of the primitives. The curve never falls."""
+    """Curve of the margin (predicted quality minus target, dB) over log2 of the number of primitives. It never falls.
+
+    ``nodes`` are the curve's points (log2 of the number, margin), in ascending order.
+    """
 
     nodes: tuple[tuple[float, float], ...]
 
     @classmethod
     def fit(cls, tried: Sequence[tuple[int, float]]) -> SizeCurve:
-        """Fit a curve to (primitives, margin) pairs. Neighbours whose margins decrease get their mean margin."""
+        """Fit a curve to (primitives, margin) pairs. Neighbours with falling margins get their mean margin."""
         blocks: list[tuple[list[float], float]] = []
         for count, margin in sorted(tried):
             blocks.append(([math.log2(count)], margin))
@@ -141,8 +150,10 @@ class SizeCurve:
 
 
 class SizeProposal(NamedTuple):
-    """Next step of a search for the number of primitives: "try" runs trials with ``primitives``, "take" means that
-    ``primitives`` is the result, and "unreachable" that no number reaches the target and ``primitives`` comes closest.
+    """Next step of a search for the number of primitives.
+
+    ``kind`` "try" asks for trials with ``primitives``. "take" means that ``primitives`` is the result. "unreachable"
+    means that no number reaches the target; ``primitives`` comes closest.
     """
 
     kind: Literal["try", "take", "unreachable"]
@@ -175,7 +186,7 @@ def propose_size(tried: Sequence[tuple[int, float]], highest: int, wanted: float
 
 
 def _move_from_tried_size(tried: int, found: int, highest: int) -> int:
-    """Return ``found``, or a number further from the only one tried if the two are too close to measure a slope."""
+    """Return ``found``, moved away from ``tried``, the only number so far, if both are too close to measure a slope."""
     step = math.log2(found / tried)
     if abs(step) < _APART:
         up, down = round(tried * 2**_APART), round(tried / 2**_APART)
@@ -224,7 +235,10 @@ class SizePredictor:
         return tuple(self.target.quality) or ("psnr",)
 
     def margin(self, values: Mapping[str, float]) -> float:
-        """Return the smallest excess of ``values`` over the target, dB; if the target sets no quality, the PSNR."""
+        """Return by how many dB the measured ``values`` exceed the target: the least over all quality measures.
+
+        If the target sets no quality, return the PSNR.
+        """
         wanted = self.target.quality
         if not wanted:
             return values["psnr"]
@@ -236,7 +250,7 @@ class SizePredictor:
         return self.margin({name: attempt.measured(name) for name in self.measures})
 
     def forecasts(self) -> dict[int, dict[str, Forecast]]:
-        """Return primitives -> measure -> predicted quality of a full run with the current settings."""
+        """Return {number of primitives: {quality measure: prediction}}, for full runs with the current settings."""
         by_name = {name: self._forecast(name) for name in self.measures}
         return {
             count: {name: own[count] for name, own in by_name.items()} for count in sorted(by_name[self.measures[0]])
@@ -265,7 +279,7 @@ class SizePredictor:
         return forecasts | {n: Forecast(value, ALLOWANCE) for n, value in full.items()}
 
     def _relevant(self, *purposes: Purpose) -> list[Attempt]:
-        """Return finished trainings whose changed settings all have the current value or one adopted earlier."""
+        """Return the finished trainings of these purposes whose settings the search uses now, or has used earlier."""
         history = self.record.history
         finished = self.record.finished(*purposes)
         return [a for a in finished if all(value in history(key) for key, value in a.words.items())]
@@ -285,8 +299,8 @@ class SizePredictor:
     def margins(self) -> list[tuple[int, float]]:
         """Return a pair (primitives, margin) for every number of primitives that was trained.
 
-        A forecast is limited to the margins of smaller and larger full runs. Between a full run that misses the target
-        and one that meets it, only full runs are returned.
+        A forecast is limited to the range between the margins of smaller and larger full runs. Between a full run that
+        misses the target and one that meets it, forecasts are left out.
         """
         margins = {
             n: self.margin({name: from_forecast_decibels(name, f.value) for name, f in values.items()})
@@ -307,7 +321,7 @@ class SizePredictor:
 
     @property
     def doubt(self) -> float:
-        """Uncertainty of the margins, dB: the smallest over all sizes."""
+        """Uncertainty of the margins, dB, for the number of primitives with the most certain prediction."""
         return min((max(f.doubt for f in values.values()) for values in self.forecasts().values()), default=1.0)
 
     def predict(self, primitives: int) -> dict[str, list[float]]:
@@ -321,7 +335,7 @@ class SizePredictor:
         return predicted
 
     def limit(self) -> int | None:
-        """Return the most primitives that the limits of bytes and speed allow; None without a limit or a trial."""
+        """Return the most primitives within the limits of bytes and speed; None if there are no limits or trials."""
         trials = [a for a in self._relevant("size", "full") if a.packed]
         limits: list[tuple[list[tuple[int, float]], float]] = []
         if self.target.megabytes is not None:

@@ -41,12 +41,13 @@ from neuprim.search.target_record import (
 from neuprim.search.trials import get_trial_setting
 
 _MAX_MARGIN, _NEAR = 0.3, 1.08
-"""A full run is good enough up to this margin above the target, dB, and up to this factor above the predicted size."""
+"""A full run is good enough up to this margin above the target, dB, and up to this many times the predicted number of
+primitives."""
 
 _TRIALS, _FULL = 0.33, 0.34  # shares of the budget for trials and for a full run; the rest is for another one
 
 _SHORTER, _PACE_STEPS, _MIN_STEPS = 8, 24, 16
-"""Full runs have this many times the steps of a trial. Steps that are timed at first; least steps of a trial."""
+"""Steps of a full run over those of a trial; steps of the first training, which is timed; least steps of a trial."""
 
 _MAX_SIZES, _MAX_CHANGES, _MAX_FULL = 6, 4, 5
 
@@ -54,7 +55,8 @@ _MIN_SLOPE = 0.8  # dB that twice as many primitives gain in full runs, at least
 _BEYOND, _BELOW = 2.0, 3.0  # a full run has at most this many times the largest, and 1/this of the smallest size tried
 
 _MIN_STEP, _MORE_STEPS = 1.07, 0.75
-"""Least factor between the sizes of two full runs, and least fraction of steps with which they can be compared."""
+"""Least factor between the numbers of primitives of two full runs, and least fraction of the steps of an earlier one
+that another full run must have."""
 
 _MORE = 1.25  # factor by which limits must allow more primitives for another full run
 _SLOWER = 1.5  # a full run that becomes this many times slower is cut short
@@ -97,8 +99,8 @@ def propose_setting_trial(
 ) -> tuple[str, SettingValue, SettingValue] | None:
     """Return (setting, current value, value to try) of the next trial; None if no trial is left.
 
-    The trial takes the middle of the remaining smaller ``values`` (:func:`list_smaller_settings`). If the changes tried
-    so far (``turns``) were not adopted, the trial is closer to the current value.
+    The value is found by bisection of ``values``, sorted by size (:func:`list_smaller_settings`). It is halfway between
+    the current value and the closest smaller one that was tried but not adopted (see ``turns``), else the smallest one.
     """
     for key, ladder in values.items():
         own = [turn for turn in turns if turn.key == key]
@@ -126,7 +128,7 @@ def setting_change_pays(loss: float, size: float, slope: float) -> bool:
 
 @dataclass
 class SizeSearch:
-    """Search for the smallest model that meets a target. A search resumes from its record."""
+    """Search for the smallest model that meets a target (quality, file size, speed). It resumes from its record."""
 
     config: RunConfig
     target: SearchTarget
@@ -139,7 +141,7 @@ class SizeSearch:
         return self.config.train.iterations or math.inf
 
     def full_steps(self, primitives: int) -> float:
-        """Return how many training steps of this many primitives fit into a full run's share of the budget."""
+        """Return how many training steps fit into a full run's share of the budget, for this number of primitives."""
         return min(self.max_steps, max(_FULL * self.record.asked["budget"] / self.runner.pace(primitives), 1.0))
 
     @property
@@ -178,8 +180,8 @@ class SizeSearch:
         )
 
     def _highest(self) -> int:
-        """Return the largest number of primitives that is within the limits, and whose full run has at least twice as
-        many steps as a trial.
+        """Return the largest number of primitives to try. It is within the target's limits, its full run has at least
+        twice as many steps as a trial, and it is not above a number at which a trial stopped growing.
         """
         low = high = self.config.model.count
         while self.full_steps(high) > 2 * self.record.length and high < 2**24:
@@ -202,7 +204,7 @@ class SizeSearch:
                     self.runner.notify(_describe_attempt(done, self.predictor.predict(done.count)))
 
     def _try_sizes(self) -> None:
-        """Run trials of different numbers of primitives until the best number is known or the time for them is used."""
+        """Run trials with different numbers of primitives, until the best is known or the time for trials is used."""
         first = min(self.config.model.count, self._highest())
         self._try_size(first)
         lengthened = False
@@ -287,7 +289,10 @@ class SizeSearch:
         self.runner.notify(self.record.out_of_reach)
 
     def _change_settings(self) -> None:
-        """Try changes of settings that save bytes, with the number of primitives tried closest to :meth:`_wanted`."""
+        """Run trials of changed settings that save bytes, and adopt the changes that pay.
+
+        The trials use that number of primitives, of those tried, that is closest to :meth:`_wanted`.
+        """
         if self.record.out_of_reach or not (self.target.quality or self.target.megabytes is not None):
             return
         values = list_smaller_settings(self.config, load_config_task(self.config), self.dataset)

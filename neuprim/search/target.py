@@ -135,8 +135,9 @@ def _check_target_config(config: RunConfig) -> None:
 
 
 def _resume_target_search(config: RunConfig, asked: dict[str, float]) -> TargetRecord:
-    """Return the record of an earlier search in the run's directory, or a new record. If the target or the budget has
-    changed, the new record has the finished trainings, and its used time is 0.
+    """Return the record of an earlier search in the run's directory, or a new record.
+
+    If the target or the budget has changed, the new record keeps the finished trainings, but no time counts as used.
     """
     folder, own = config.output_dir, (*NOT_TRAINED_WITH, "made_by")
     same: dict[str, Any] = json.loads(json.dumps({k: v for k, v in config.to_dict().items() if k not in own}))
@@ -192,7 +193,7 @@ def choose_full_run(predictor: SizePredictor) -> Attempt:
 
 
 def _finish_target_search(runner: TrialRunner, predictor: SizePredictor) -> None:
-    """Write the run directory of the best full run, prune and quantize its model, and record what was achieved."""
+    """Turn the best full run into the run directory, prune and quantize the model, and record what was achieved."""
     record, target = runner.record, predictor.target
     attempt = choose_full_run(predictor)
     record.chosen = attempt.folder
@@ -223,7 +224,7 @@ def _finish_target_search(runner: TrialRunner, predictor: SizePredictor) -> None
 
 
 def _write_target_result(runner: TrialRunner, attempt: Attempt) -> _TargetResult:
-    """Write the run directory from the folder of the chosen full run, and measure its test views."""
+    """Copy the chosen full run from its folder to the run directory, evaluate the test views, and return the result."""
     config, folder = runner.configure(attempt), runner.config.output_dir
     runner.events(Finishing("measuring test views"))
     resumed = replace(config, resume=True)
@@ -240,7 +241,7 @@ def _write_target_result(runner: TrialRunner, attempt: Attempt) -> _TargetResult
 
 
 def _measure_target_held_out(runner: TrialRunner, model: Primitives) -> dict[str, float]:
-    """Return PSNR and SSIM of the held-out training views with which the search compares trainings."""
+    """Return a model's PSNR and SSIM on the held-out training views, on which the search compares trainings."""
     dataset, settings = hold_out_views(runner.dataset, runner.record.hold_out), runner.config.renderer
     views = choose_trial_views(dataset, VIEWS)
     with torch.no_grad():
@@ -252,7 +253,10 @@ def _measure_target_held_out(runner: TrialRunner, model: Primitives) -> dict[str
 def _prune_full_run(
     runner: TrialRunner, predictor: SizePredictor, attempt: Attempt, before: _TargetResult
 ) -> _TargetResult:
-    """Return the result after pruning as far as the target allows, in half of the time left; else ``before``."""
+    """Prune the model of a full run as far as the target allows, in half of the time left; return the new result.
+
+    Return ``before`` if the target leaves no room, if too little time is left, or if pruning saves no bytes.
+    """
     record, margin = runner.record, predictor.margin(before.held)
     if not predictor.target.quality or margin < 0:
         return before
@@ -283,8 +287,10 @@ def _prune_full_run(
 
 
 def _quantize_target_model(runner: TrialRunner, predictor: SizePredictor, before: _TargetResult) -> _TargetResult:
-    """Quantize the model as coarsely as the target allows. If the model misses the target already, lose at most
-    :data:`ALLOWANCE` dB more. If the target is only a limit of bytes, quantize as finely as the limit allows.
+    """Write the quantized model file; return the new result. The file is as coarse as the target quality allows.
+
+    If the model misses the target already, it loses at most :data:`ALLOWANCE` dB more. If the target is only a limit of
+    bytes, the file is as fine as the limit allows.
     """
     target, task, file = predictor.target, load_config_task(runner.config), before.run_dir / COMPRESSED
     model, header = load_model_checkpoint(before.run_dir / "model.safetensors", task)

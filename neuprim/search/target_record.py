@@ -136,7 +136,7 @@ class TargetRecord:
 
     @property
     def words(self) -> dict[str, SettingValue]:
-        """Setting -> new value, of the changes adopted so far."""
+        """Dict of the changes of settings adopted so far: setting -> new value."""
         return {turn.key: turn.after for turn in self.turns if turn.adopted}
 
     def history(self, key: str) -> list[SettingValue]:
@@ -197,7 +197,7 @@ def forecast_time(known: Sequence[tuple[int, float]], primitives: float) -> floa
 
 @dataclass
 class TrialRunner:
-    """Run the trainings that a target search requests. A training whose outcome is in the record is not repeated.
+    """Runner of the trainings of a target search. A training whose outcome is in the record is not repeated.
 
     Attributes:
         config: configuration from which the search starts.
@@ -236,7 +236,8 @@ class TrialRunner:
     def configure(self, attempt: Attempt) -> RunConfig:
         """Return the configuration of a training, which writes to a folder of its own.
 
-        Population control intervenes as often as in a full run. With fewer interventions, short trials lose 0.5 dB.
+        Population control (which adds and moves primitives) runs about as many times as in a full run. If it ran less
+        often, short trials would lose 0.5 dB.
         """
         whole, every = self.config.train.iterations, self.config.train.population.every
         if whole is not None and attempt.steps < whole:
@@ -316,7 +317,7 @@ class TrialRunner:
         return max([0.0, *(a.seconds - a.measured("pace") * a.steps for a in finished[-3:])])
 
     def fits(self, primitives: int, steps: float, share: float) -> bool:
-        """Return whether a trial would end before the fraction ``share`` of the budget is used."""
+        """Return whether a trial of this size and length would end before ``share`` (0..1) of the budget is used."""
         seconds = self.pace(primitives) * steps + self.overhead()
         return self.seconds_spent + seconds <= share * self.record.asked["budget"]
 

@@ -1,4 +1,7 @@
-"""Measure the points of a trade-off: image quality, file size, and frame times, which are measured in rounds."""
+"""Measure the points of a trade-off (render configurations or trained models): image quality, file size, frame times.
+
+Frame times are measured in rounds, so that load of the machine affects all points alike.
+"""
 
 from __future__ import annotations
 
@@ -58,14 +61,14 @@ class TradeoffSetup:
     _prepared: dict[tuple[object, ...], Primitives] = field(default_factory=dict)
 
     def overrides(self, config: RenderConfig) -> tuple[str, ...]:
-        """Return the overrides of ``neuprim render`` that give a configuration."""
+        """Return the overrides of ``neuprim render`` (``key=value``) that select a render configuration."""
         return config.to_overrides(self.config.renderer)
 
     def parse(self, overrides: Sequence[str]) -> RenderConfig:
         return parse_run_rendering(overrides, self.config.renderer, self.model)
 
     def prepare_model(self, config: RenderConfig) -> Primitives:
-        """Return the model reduced for a configuration, on the configuration's device; recent models are cached."""
+        """Return the model for a configuration: fields reduced, on the right device. Recent models are cached."""
         key = (tuple(config.reduced.items()), config.settings.backend, config.settings.device)
         if key not in self._prepared:
             model = move_to_render_device(config.prepare_model(self.model), config.settings, self.views[0].view)
@@ -76,7 +79,7 @@ class TradeoffSetup:
         return self._prepared[key]
 
     def backend(self, config: RenderConfig) -> backends.Backend:
-        """Return the backend that renders a configuration."""
+        """Return the backend that renders images with a configuration."""
         model, view = self.prepare_model(config), config.scale_view(self.views[0].view)
         lowered = model.lower(view.camera, view.conditions, shaded=False)
         return backends.choose_backend(lowered, config.settings, view.camera)
@@ -165,8 +168,8 @@ def describe_tradeoff_setup(setup: TradeoffSetup) -> dict[str, Any]:
 
 
 def measure_point(setup: TradeoffSetup, knob: str, config: RenderConfig) -> TradeoffPoint:
-    """Measure a render configuration that changes the setting ``knob``. Return a point with the mean image metrics over
-    the views and the bytes of the model file.
+    """Measure the render configuration ``config``, which changes the setting ``knob``. Return a point with the image
+    metrics, averaged over the views, and the bytes of the model file; frame times are measured later.
     """
     model, draw = setup.prepare_model(config), setup.renderer(config)
     rows: list[dict[str, float]] = []
@@ -188,7 +191,7 @@ def measure_point(setup: TradeoffSetup, knob: str, config: RenderConfig) -> Trad
 
 
 class TimedPoint(NamedTuple):
-    """A trade-off's point whose frame times are to be measured, and a function that returns its renderer."""
+    """A point of a trade-off whose frame times are to be measured, and a function that returns its renderer."""
 
     point: TradeoffPoint
     renderer: Callable[[], Renderer]
@@ -203,10 +206,10 @@ def time_tradeoff_points(
 ) -> None:
     """Measure frame times of points in rounds. The first point is the reference, rendered several times in every round.
 
-    In a round, every point that lacks rounds renders every view, in random order. Each frame is rendered twice. Only
-    the second time counts, because the model is then in the caches. A round adds to each point the mean milliseconds
-    per frame, and the frame time divided by the reference's. The latter is a median over views, so brief load of the
-    machine has no effect.
+    In a round, every point with fewer than ``repeats`` rounds renders every view, in random order. Each frame is
+    rendered twice. Only the second time counts, because the model is then in the caches. A round adds to each point the
+    mean milliseconds per frame, and the frame time divided by the reference's. The latter is a median over views, so
+    brief load of the machine has no effect.
 
     Args:
         repeats: number of rounds that each point should have, including earlier ones.
@@ -273,7 +276,7 @@ class TradeoffRequest:
 
 
 class TradeoffSession:
-    """Measure the points of a trade-off within a budget, find the Pareto fronts, and write the record and a page.
+    """Session that measures the points of a trade-off within a time budget and writes the record and an HTML page.
 
     Args:
         folder: folder for ``tradeoff.json`` and its page.
@@ -285,11 +288,11 @@ class TradeoffSession:
         self.begun = time.monotonic()
 
     def point_setup(self, number: int) -> tuple[TradeoffSetup, RenderConfig]:
-        """Return the setup with the model of point ``number``, and the render configuration of the point."""
+        """Return the setup (model, views, data) and the render configuration of the record's point ``number``."""
         raise NotImplementedError
 
     def seconds_left(self, part: float) -> float:
-        """Return the seconds until the fraction ``part`` of the budget is used."""
+        """Return the seconds left until the fraction ``part`` (0..1) of the time budget is used."""
         return self.begun + part * self.request.budget - time.monotonic()
 
     @property
@@ -301,7 +304,10 @@ class TradeoffSession:
         self.record.write(self.folder / TRADEOFF_FILE)
 
     def choose_knobs(self, knobs: Mapping[str, list[T]]) -> dict[str, list[T]]:
-        """Return setting -> values for the settings that the request names; record those without another value."""
+        """Return the entries of ``knobs`` (setting -> values to try) that the request names; all if it names none.
+
+        Settings without values to try are noted in the record.
+        """
         chosen = {name: own for name, own in knobs.items() if not self.request.knobs or name in self.request.knobs}
         for name, own in chosen.items():
             if not own:
@@ -323,13 +329,19 @@ class TradeoffSession:
         time_tradeoff_points(timed, self.request.repeats, views, deadline, note_round)
 
     def write_results(self, command: Callable[[Sequence[str]], str]) -> None:
-        """Write record, page and chart of the fronts; ``command`` makes a point's command line from its overrides."""
+        """Write the record, the HTML page, and the chart of the Pareto fronts.
+
+        ``command`` turns the overrides of a point into the command line that the page shows.
+        """
         self.write_record()
         self.progress("pictures of the front", 0.0)
         write_tradeoff_page(self.folder, self.record.to_dict(), self._render_front_pictures(), command)
 
     def _render_front_pictures(self) -> dict[int, TradeoffPicture]:
-        """Return pictures of the points on the fronts by number, in the view with most contrast; -1: ground truth."""
+        """Return index of a point -> its picture, for the first point and the Pareto fronts; -1 is the ground truth.
+
+        All pictures show the evaluation view with most contrast.
+        """
         setup, _ = self.point_setup(0)
         view = max(setup.views, key=lambda one: float(setup.channels.display(one.image).var()))
         truth = setup.display(view.image)

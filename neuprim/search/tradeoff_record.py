@@ -66,8 +66,9 @@ def pareto_front(points: Sequence[T], objectives: Callable[[T], Objectives]) -> 
 
 
 class ParetoStep(NamedTuple):
-    """A change of a single setting (``knob``): its override, its gain (log of the factor by which the cost drops), and
-    its loss of quality.
+    """A change of a single setting (``knob``): its override, its gain, and its loss.
+
+    The gain is usually the log of the factor by which the cost (time or bytes) drops, and the loss is PSNR in dB.
     """
 
     knob: str
@@ -102,8 +103,10 @@ def chain_pareto_steps(steps: Sequence[ParetoStep], min_gain: float = 0.01) -> l
 def combine_pareto_steps(
     directions: Sequence[Sequence[ParetoStep]], known: Sequence[Sequence[str]], most: int
 ) -> list[tuple[str, ...]]:
-    """Return at most ``most`` combinations that are not ``known``. A direction is a list of steps with one goal, e.g.
-    fewer bytes. The combinations are evenly spread along the directions' chains (:func:`chain_pareto_steps`).
+    """Return at most ``most`` new combinations of overrides, i.e. none of ``known``.
+
+    A direction is a list of steps with one goal, e.g. fewer bytes. For each direction, :func:`chain_pareto_steps` makes
+    a chain of combinations. The returned ones are evenly spread along all chains.
     """
     taken = {frozenset(overrides) for overrides in known}
     chains = [[way for way in chain_pareto_steps(steps) if frozenset(way) not in taken] for steps in directions]
@@ -170,7 +173,7 @@ class TradeoffPoint:
 
     @property
     def time(self) -> float:
-        """Milliseconds per frame. For trained models they are ``ratio * centre_ms``, because load varies by round."""
+        """Milliseconds per frame. For trained models ``ratio * centre_ms``, as the load varies between rounds."""
         if self.centre_ms:
             return self.ratio * self.centre_ms
         return statistics.median(self.ms) if self.ms else float("nan")
@@ -189,7 +192,7 @@ class TradeoffPoint:
 
     @property
     def doubt(self) -> float:
-        """Uncertainty of the median ratio (McGill's notches); the ratio itself for fewer than three rounds."""
+        """Uncertainty of :attr:`ratio`, by McGill's notched box plots; the ratio itself for fewer than three rounds."""
         if self.spread is None:
             return self.ratio if self.ratios else 0.0
         return 3.14 * self.spread / len(self.ratios) ** 0.5
@@ -256,13 +259,16 @@ class TradeoffRecord:
         return [name for name in same if self.same.get(name) != same[name]]
 
     def leave_out(self, knob: str, words: Sequence[str], reason: str) -> None:
-        """Note why a point is not measured; replaces an earlier note on the same point."""
+        """Note the reason why a point is not measured. The note replaces an earlier note on the same point."""
         words = tuple(words)
         others = [one for one in self.left_out if (one.knob, one.words) != (knob, words)]
         self.left_out = [*others, LeftOutPoint(knob, words, reason)]
 
     def find_fronts(self, in_size: Callable[[TradeoffPoint], bool] = lambda point: True) -> None:
-        """Compute both Pareto fronts. The front of bytes only uses points for which ``in_size`` is true."""
+        """Set :attr:`speed` and :attr:`size`, the Pareto fronts of PSNR against frame time and against bytes.
+
+        The front of bytes only uses points for which ``in_size`` is true.
+        """
         costs = [
             (Objectives(p.ratio, psnr := round(p.quality["psnr"], _DIGITS), p.doubt), Objectives(float(p.bytes), psnr))
             for p in self.points

@@ -90,7 +90,7 @@ class TrialRecord:
 
 
 class TrialFailed(NeuprimError):
-    """A launched trial failed; the message says why."""
+    """Error: a trial that a launcher ran has failed. The message says why."""
 
 
 def read_trial(folder: Path) -> TrialRecord | None:
@@ -173,7 +173,7 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ign
 
 
 def _trial_request(trial: Trial) -> dict[str, Any]:
-    """Return the settings that must be equal to reuse a trial's folder, converted to JSON and back."""
+    """Return the settings that must be equal to reuse a trial's folder, with the types that reading JSON gives."""
     config = replace(trial.config, made_by=current_config_provenance(trial.config, load_config_task(trial.config)))
     settings = {name: value for name, value in config.to_dict().items() if name not in NOT_TRAINED_WITH}
     request: dict[str, Any] = json.loads(json.dumps({**settings, "hold_out": trial.hold_out}))

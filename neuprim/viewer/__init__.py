@@ -1,1 +1,1 @@
-"""Live viewer: render a model in this process and show the images in a browser page, after or during the training."""
+"""Live viewer: render a model in the Python process and show the images in a browser, after or during training."""

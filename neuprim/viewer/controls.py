@@ -1,4 +1,7 @@
-"""The controls of a viewer's page (conditions, render settings, held-out views, primitives), and its open pages."""
+"""The controls of a viewer's browser page (conditions, render settings, held-out views, primitives).
+
+:class:`SessionManager` adds them to each opened page.
+"""
 
 from __future__ import annotations
 
@@ -38,14 +41,15 @@ _YELLOW = np.array([[255, 210, 0]], np.uint8)
 
 
 def format_viewer_condition(spec: ConditionSpec, value: Tensor, world: World) -> str:
-    """Return a condition's value as text, in the form that ``neuprim render`` takes."""
+    """Return the value of a condition, e.g. time or light position, as text, as ``neuprim render`` takes it."""
     digits = 4 if spec.place is None or world.identity else 10
     return ",".join(f"{x:.{digits}g}" for x in spec.given(value, world).flatten().tolist())
 
 
 class ConditionControls:
-    """Controls of each condition: a text field and a play button, a slider if the condition's range is bounded, and a
-    draggable handle if the condition is a position.
+    """Controls of each condition of the task, e.g. time or light position: a text field and a play checkbox.
+
+    A number with a bounded range also has a slider, and a position has a draggable handle.
     """
 
     def __init__(self, session: Session) -> None:
@@ -93,7 +97,7 @@ class ConditionControls:
         return format_viewer_condition(spec, self.session.conditions[spec.name], self.session.scene.world)
 
     def _add_handle(self, spec: ConditionSpec) -> Any:
-        """Add a draggable handle to the 3D scene for a condition that is a position."""
+        """Add a draggable handle to the 3D scene and return it, if the condition is a position; else return None."""
         if spec.shape != (3,) or "scene units" not in spec.unit:
             return None
         value, scene = self.session.conditions[spec.name], self.session.client.scene
@@ -295,7 +299,7 @@ class PrimitiveControls:
         self._show_meshes("/chosen", found, wire=True)
 
     def _show_meshes(self, name: str, found: FrameEllipsoids | None, wire: bool) -> None:
-        """Replace the ellipsoids of the scene node ``name``; None removes them."""
+        """Replace the ellipsoids of viser's scene node ``name`` by ``found``; None only removes the old ones."""
         if name in self._meshes:
             self._meshes.pop(name).remove()
         if found is None or not len(found.rows):
@@ -320,7 +324,10 @@ class PrimitiveControls:
 
 
 class SessionManager:
-    """Create a session for each opened page and drop it when the page closes. ``sessions``: page id -> session."""
+    """Manager of the open pages: it creates a session for each opened page, and drops it when the page closes.
+
+    ``sessions`` maps the id of an open page to its session.
+    """
 
     def __init__(
         self,

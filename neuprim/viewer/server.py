@@ -1,11 +1,12 @@
 """The viewer's web server: viser with checks of every request and every message.
 
 viser accepts every client, including any web page open in the user's browser, because browsers let pages open
-WebSockets to this machine. So a request needs a secret token, the server's own host name, and the viewer's page as
-origin. The printed address contains the token. The page gets it as a cookie, which other sites' pages cannot send.
+WebSockets to this machine. Therefore a request must have a secret token, the server's own host name, and the viewer's
+page as origin. The printed address contains the token. The page gets it as a cookie, which pages of other sites cannot
+send.
 
-viser does not check messages either. :class:`ViewerConnection` passes a message only if the page's own code sends
-messages of this type. It passes a control's value only if the control can take this value.
+viser does not check messages either. :class:`ViewerConnection` passes a message only if the code of the viewer's page
+sends messages of this type. It passes a new value of a control only if the control can take this value.
 
 Importing this module raises BackendUnavailable if viser is missing.
 """
@@ -131,7 +132,7 @@ class TokenAuth:
         return None
 
     def _is_own_name(self, host: str) -> bool:
-        """Return whether ``host`` is a name of this server.
+        """Return whether ``host``, from a request's Host header, is a name of this server.
 
         A server that listens on all addresses accepts any IP address: DNS rebinding attacks need a host name.
         """
@@ -152,7 +153,7 @@ def _is_unspecified_viewer_host(host: str) -> bool:
 
 
 def _cookie_name(host: str) -> str:
-    """Return the cookie's name. The name contains the port, because browsers send cookies to all ports of a host."""
+    """Return the name of the token's cookie. It contains the port, as browsers send cookies to all ports of a host."""
     return f"neuprim-{host.rpartition(':')[2] if re.search(r':[0-9]+$', host) else '80'}"
 
 
@@ -169,7 +170,7 @@ _Name = Annotated[str, Meta(max_length=1024)]
 
 
 class _Message(msgspec.Struct, tag_field="type", forbid_unknown_fields=True):
-    """Base class of the messages that the page needs. Others are refused, e.g. uploads, commands, shared pages."""
+    """Base class of the messages that the viewer accepts from a page. All others are refused, e.g. file uploads."""
 
 
 class ViewerCameraMessage(_Message):
@@ -244,7 +245,10 @@ class ViewerConnection(websocket_server.ServerConnection):
 
 
 def refuse_message(message: bytes | str, find_control: Callable[[str], Any]) -> str | None:
-    """Return why a message must be dropped, else None; ``find_control`` returns viser's handle of a control id."""
+    """Return why a message from a page must be dropped; None if it is accepted.
+
+    ``find_control`` maps the id of a control to viser's handle, or to None if there is no such control.
+    """
     if not isinstance(message, bytes):
         return "a message in text; expected msgpack"
     try:

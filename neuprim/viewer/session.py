@@ -1,7 +1,7 @@
 """One open page of the viewer: its camera, conditions and settings, and the queue of jobs that render its images.
 
-While camera or conditions change, images have the resolution that can be rendered smoothly. When the changes stop, the
-image is rendered at full resolution.
+While camera or conditions change, the resolution of images is reduced so far that motion is smooth. When the changes
+stop, the image is rendered at full resolution.
 """
 
 from __future__ import annotations
@@ -108,7 +108,10 @@ class RenderQueue:
 
 
 def next_resolution(resolution: float, seconds: float) -> float:
-    """Return the resolution factor of the next image during motion, from factor and render time of the last image."""
+    """Return the factor on the resolution of the next image during motion, at most 1.
+
+    It follows from the factor (``resolution``) and the render time of the last image.
+    """
     if seconds > _SMOOTH_SECONDS:
         return max(resolution / 2, _MIN_RESOLUTION)
     return min(resolution * 2, 1.0) if seconds < _SMOOTH_SECONDS / 4 else resolution
@@ -116,7 +119,7 @@ def next_resolution(resolution: float, seconds: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ViewerPose:
-    """A page's camera without an image size: pose and field of view.
+    """Camera of a browser page, without an image size: pose and field of view.
 
     Attributes:
         wxyz: (4,) unit quaternion, camera to world, OpenCV axes (x right, y down, z forward).
@@ -130,7 +133,7 @@ class ViewerPose:
 
     @classmethod
     def from_camera(cls, camera: Camera) -> ViewerPose:
-        """Convert a camera; its principal point is dropped."""
+        """Return the pose and vertical field of view of a pinhole camera; the principal point is dropped."""
         view = camera.viewmat.detach().double().cpu().numpy()
         x, y, z, w = Rotation.from_matrix(view[:3, :3].T).as_quat()
         position, fov = -view[:3, :3].T @ view[:3, 3], 2 * math.atan(0.5 * camera.height / camera.fy)
@@ -158,7 +161,7 @@ def fit_viewer_size(size: Sequence[int], longest: float) -> tuple[int, int]:
 
 
 class Session:
-    """State of one open page. Methods are thread-safe; every use of the model is a job in the queue.
+    """State of one open browser page. Methods are thread-safe; every use of the model is a job in the queue.
 
     Attributes:
         client: a ``viser.ClientHandle``.
@@ -210,8 +213,10 @@ class Session:
             self.notify(f"{type(error).__name__}: {error}", "red")
 
     def set_camera(self, pose: ViewerPose) -> None:
-        """Move the page's camera. Dragging then turns the camera around the point on its viewing axis that is closest
-        to the scene's centre."""
+        """Move the page's camera to ``pose``.
+
+        Dragging then turns it around the point of its viewing axis that is closest to the scene's centre.
+        """
         forward = pose.rotation[:, 2]
         offset = self.scene.center - pose.position
         ahead = max(float(forward @ offset), 1e-2 * float(np.linalg.norm(offset))) or 1.0
@@ -241,12 +246,11 @@ class Session:
         self.redraw()
 
     def submit(self, kind: str, run: Callable[[], None], delay: float = 0.0, replace: bool = True) -> None:
-        """Queue ``run`` for the thread that may use the model; errors appear in the page. See :class:`RenderQueue`."""
+        """Queue a job for the thread that may use the model; the page shows errors. See :class:`RenderQueue`."""
         self.queue.submit((self.client.client_id, kind), run, self.report_error, delay, replace)
 
     def redraw(self) -> None:
-        """Queue an image at a resolution that keeps motion smooth, then a full-resolution image when nothing
-        changes."""
+        """Queue an image at a resolution that keeps motion smooth, and one at full resolution when changes stop."""
         self.submit("picture", self._draw_fast)
 
     def draw(self, full: bool = False) -> bool:

@@ -1,8 +1,8 @@
-"""Viewers of a finished run, ``neuprim view``, and of a running training.
+"""Browser viewers of a finished run (``neuprim view``) and of a running training.
 
 During a training, images are rendered between two training steps, on the training thread. The trained model is
-bit-identical to one trained without a viewer. Rendering time does not count towards the budget. Without open pages the
-viewer only checks its queue once per step.
+bit-identical to one trained without a viewer. Rendering time does not count towards the training budget. Without open
+pages the viewer only checks its queue of jobs once per training step.
 """
 
 from __future__ import annotations
@@ -75,8 +75,8 @@ class TrainingProgress:
 
     Attributes:
         fraction: used fraction of the budget, 0..1.
-        text: what the run does now.
-        curves: name -> points (step, finite PSNR in dB): of the training views, smoothed, and of the held-out views.
+        text: the current activity of the run, for the user.
+        curves: "training views" (smoothed) or "held-out views" -> points (training step, PSNR in dB).
     """
 
     def __init__(self) -> None:
@@ -149,9 +149,9 @@ class TrainingControls:
 
 
 class LiveTraining:
-    """Viewer of a running training: a context manager around the run, and a listener for its events.
+    """Viewer of a running training: a context manager around the run, and a callable that receives the run's events.
 
-    The training calls :meth:`between` between its steps.
+    The training calls :meth:`between` between two training steps.
 
     Raises:
         ConfigError, BackendUnavailable: see :class:`~neuprim.viewer.server.ViewerServer`.
@@ -209,7 +209,10 @@ class LiveTraining:
     # Called by the training.
 
     def between(self, fitted: Fitted, stop: threading.Event) -> None:
-        """Render images and carry out requests of the pages; see :data:`~neuprim.runs.training.BetweenSteps`."""
+        """Render images for the pages and carry out their requests, e.g. pause; called between two training steps.
+
+        Setting ``stop`` ends the training. See :data:`~neuprim.runs.training.BetweenSteps`.
+        """
         if self._sessions is None:
             scene = self._make_scene(fitted)
             self._sessions = SessionManager(

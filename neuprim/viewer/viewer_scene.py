@@ -46,7 +46,10 @@ _MAX_NUMBERS = 24  # values of a parameter that are written out
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """What a page shows: camera, values of the task's conditions, and a quantity of :func:`list_viewer_quantities`."""
+    """What a browser page shows: camera, values of the task's conditions (e.g. the time), and a quantity.
+
+    The quantity is one of :func:`list_viewer_quantities`, e.g. "colour" or "depth".
+    """
 
     camera: Camera
     conditions: Mapping[str, Tensor] = field(default_factory=dict)
@@ -124,7 +127,7 @@ class ViewerScene:
 
     @cached_property
     def view_indices(self) -> Mapping[str, int]:
-        """View name -> index, for the held-out views with a pinhole camera."""
+        """Dict of the held-out views with a pinhole camera: name -> index in the test split. Empty without data."""
         if self.dataset is None:
             return {}
         views = self.dataset.test
@@ -150,7 +153,7 @@ class ViewerScene:
 
     @cached_property
     def start_view(self) -> View:
-        """First view of a page: the held-out view with most contrast or, without data, the model from the side."""
+        """View with which a page opens: the held-out view with most contrast; without data, a view from the side."""
         if self.dataset is not None:
             views = held_out_webpage_views(self.dataset, self.channels, _START_CANDIDATES, truths=False)
             if views:
@@ -209,7 +212,7 @@ def _to_viewer_grey(values: Tensor) -> np.ndarray:
 
 
 def _colour_viewer_depth(depth: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, str]:
-    """Convert depth to (H, W, 3) uint8 colours, bright where near and black where empty; also return a caption."""
+    """Convert (H, W) depth to (H, W, 3) uint8 colours, bright if near, black if empty; return them and a caption."""
     solid = alpha > _MIN_ALPHA
     image = np.zeros((*depth.shape, 3), np.uint8)
     if not solid.any():
@@ -243,7 +246,7 @@ class FrameEllipsoids(NamedTuple):
 def list_viewer_ellipsoids(
     model: Primitives, viewpoint: Viewpoint, channels: Channels, limit: int, row: int | None = None
 ) -> FrameEllipsoids:
-    """Return the ellipsoids of the ``limit`` primitives that absorb most, or only of primitive ``row``, if given."""
+    """Return the ellipsoids of the ``limit`` primitives that absorb most light; with ``row``, only of this one."""
     with torch.no_grad():
         lowered = model.lower(viewpoint.camera, viewpoint.conditions)
         geometry = lowered.geometry

@@ -1,5 +1,4 @@
-"""Make one HTML file that shows a model: parameters, cameras and images of its scene, and the scripts that render
-it."""
+"""Make one HTML file that shows a model. It has the parameters, cameras and images, and the scripts that render."""
 
 from __future__ import annotations
 
@@ -58,7 +57,7 @@ class Condition(NamedTuple):
 
 @dataclass(frozen=True)
 class PageView:
-    """A camera that the page can jump to; ``truth`` is its image as ``data:image/...``, or "" without an image."""
+    """A view that the page can jump to; ``truth`` is its ground truth image as ``data:image/...``, or "" for none."""
 
     name: str
     camera: Camera
@@ -170,7 +169,7 @@ def make_model_webpage(
 
 
 def _field_script(kind: str, field: Field) -> str:
-    """Return the script with which a browser evaluates the field, without its comment."""
+    """Return the JavaScript with which a browser evaluates the field, without the comment lines at the top."""
     text = field.script()
     if text is None:
         raise ConfigError(
@@ -265,7 +264,9 @@ def stored_up_axis(header: Mapping[str, Any]) -> tuple[float, ...]:
 
 
 def fullest_webpage_conditions(model: Primitives, conditions: Sequence[Condition]) -> dict[str, Tensor]:
-    """Return the initial conditions. If no primitive is active, change one condition so that most are active."""
+    """Return the initial values of the conditions, e.g. the time. If no primitive is active at these values, change one
+    condition so that as many primitives as possible are active.
+    """
     start = {condition.spec.name: condition.value for condition in conditions}
     if model.active(start).geometry.count:
         return start
@@ -280,7 +281,10 @@ def fullest_webpage_conditions(model: Primitives, conditions: Sequence[Condition
 
 @torch.no_grad()
 def _measure_webpage_extent(model: Primitives, conditions: Mapping[str, Tensor]) -> tuple[list[float], float, float]:
-    """Return centre and radius of all active primitives, and the 95 % quantile of the extinction at their centres."""
+    """Return centre and radius of a sphere around 98 % of the active primitives, and a typical extinction.
+
+    The latter is the 95 % quantile of the extinction at the centres of the primitives.
+    """
     active = model.active(conditions)
     if not active.geometry.count:
         return [0.0, 0.0, 0.0], 1.0, 1.0
@@ -293,7 +297,7 @@ def _measure_webpage_extent(model: Primitives, conditions: Mapping[str, Tensor])
 
 
 def _make_webpage_camera(middle: Sequence[float], radius: float, up: Sequence[float]) -> Camera:
-    """Make a camera that sees a sphere of this centre (``middle``) and radius, from the side and slightly above."""
+    """Return a camera that shows a sphere with centre ``middle`` and this radius, from the side and slightly above."""
     template = Camera(torch.eye(4, dtype=torch.float64), 717.0, 717.0, 256, 256, 512, 512)
     return orbit(template, torch.tensor(middle), torch.tensor(up), 3.2 * radius, 0.4, 1)[0]
 
@@ -318,7 +322,7 @@ def _view_json(view: PageView) -> dict[str, Any]:
 
 
 def _condition_json(condition: Condition) -> dict[str, Any]:
-    """Describe a condition for the page's controls. A range that is too long for a slider is shortened."""
+    """Return a condition as JSON for the page's controls. A range that is too long for a slider is shortened."""
     spec = condition.spec
     low, high = (min(max(float(end), -_JSON_INFINITY), _JSON_INFINITY) for end in spec.range)
     if spec.shape == () and high - low > _MAX_SLIDER_RANGE:
@@ -336,10 +340,11 @@ _QUADRATURE_POINTS = 16  # for chords that the near plane cuts; with 8 of them e
 
 
 def shader_constants(edge: int) -> dict[str, list[float]]:
-    """Return constants of the page's shader: polynomials in z = v^2 and the positive half of a Gauss rule.
+    """Return constants of the page's shader: coefficients of polynomials in z = v^2, and a Gauss-Legendre rule.
 
-    The polynomials, highest power first, hold for |v| <= 1/2: ``cos`` is cos(2 pi v), ``sinc`` is
-    sin(2 pi v)/(2 pi v), and "edge" is B_p(2 pi v) of :mod:`neuprim.core.model.edge` for p = ``edge``.
+    The polynomials, highest power first, approximate functions of v for |v| <= 1/2: "cos" is cos(2 pi v), "sinc" is
+    sin(2 pi v)/(2 pi v), and "edge" is B_p(2 pi v) of :mod:`neuprim.core.model.edge` for p = ``edge``. "nodes" and
+    "weights" are the positive half of the quadrature rule.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
     turn = 2 * math.pi
@@ -353,7 +358,7 @@ def shader_constants(edge: int) -> dict[str, list[float]]:
 
 
 def _fit_webpage_polynomial(function: Callable[[np.ndarray], np.ndarray]) -> list[float]:
-    """Fit a polynomial at the Chebyshev points of z in [0, 1/4]."""
+    """Return a polynomial in z = v^2 that fits ``function``(v) for 0 <= v <= 1/2: coefficients, highest power first."""
     z = 0.125 * (1 + np.cos(np.pi * (np.arange(_FIT_SAMPLES) + 0.5) / _FIT_SAMPLES))
     fit = np.polynomial.chebyshev.Chebyshev.fit(z, function(np.sqrt(z)), _DEGREE, domain=[0, 0.25])
     return fit.convert(kind=np.polynomial.Polynomial).coef[::-1].tolist()  # type: ignore[no-any-return]
@@ -377,7 +382,7 @@ class PackedModel(NamedTuple):
 
 
 def pack_webpage_model(model: Primitives, level: int) -> PackedModel:
-    """Pack all parameters: without loss at level 0, else quantised like ``neuprim compress --level`` 1 to 5.
+    """Pack all parameters for a page: exactly at level 0, else quantised as by ``neuprim compress --level`` 1 to 5.
 
     Raises:
         ConfigError: the level does not exist.

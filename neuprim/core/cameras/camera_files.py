@@ -1,6 +1,6 @@
-"""Read cameras from files: JSON with frames or a camera path, USD stages and COLMAP models.
+"""Read cameras from files: JSON with a list of frames or a camera path, USD stages, and COLMAP models.
 
-Pixar's library reads USD stages in a separate process, with limits of time and memory.
+USD stages are read with Pixar's USD library, in a separate process with limits on time and memory.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ _VIEWER_NOTE = (
 def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraViews:
     """Read the cameras of a JSON file, a USD stage or a COLMAP model.
 
-    JSON files have ``frames``, or the ``camera_path`` of nerfstudio's viewer. ``FILE#/PRIM`` chooses one camera of a
-    USD stage.
+    A JSON file has a list ``frames``, as in ``transforms.json``, or the ``camera_path`` that nerfstudio's viewer
+    writes. The path ``FILE#/PRIM`` chooses one camera of a USD stage by its prim.
 
     Args:
         size: (width, height) in pixels, for files that do not state an image size.
@@ -108,7 +108,7 @@ def _read_camera_file_times(records: list[JsonReader], key: str) -> tuple[float,
 
 
 def _read_camera_frame_rate(document: JsonReader, count: int) -> float | None:
-    """Return a file's frames per second: field ``fps``, else ``count`` / field ``seconds``; None without either."""
+    """Return the frames per second: field ``fps``, else ``count`` frames / field ``seconds``; None without either."""
     for key in ("fps", "seconds"):
         if document.has(key):
             value = document.number(key, "a number above 0", 0.0)
@@ -120,7 +120,11 @@ def _read_camera_frame_rate(document: JsonReader, count: int) -> float | None:
 
 
 def _read_camera_frames(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
-    """Read ``{"w", "h", "camera_angle_x" | "fl_x"[, ...], "frames": [{"transform_matrix", ...}]}``."""
+    """Read the cameras of a JSON file in the format of ``transforms.json``.
+
+    The keys are ``{"w", "h", "camera_angle_x" | "fl_x"[, ...], "frames": [{"transform_matrix", ...}]}``. ``size`` is
+    (width, height) in pixels, for a file without ``w`` and ``h``. A note says if lens distortion is left out.
+    """
     records, found, bent = _camera_records(document, "frames"), [], 0
     notes: dict[str, None] = {}
     refuse_unsupported_camera_keys(document)
@@ -147,7 +151,7 @@ def _read_camera_frames(document: JsonReader, size: tuple[int, int] | None) -> C
 
 
 def _read_camera_path(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
-    """Read a camera path of nerfstudio's viewer, where ``fov`` is vertical, in degrees, and axes are OpenGL's."""
+    """Read a nerfstudio ``camera_path``: ``fov`` is vertical, in degrees; poses are camera to world, OpenGL axes."""
     if document.values.get("camera_type", "perspective") != "perspective":
         raise document.fail("camera_type", "perspective, the only supported type")
     records = _camera_records(document, "camera_path")
@@ -168,7 +172,7 @@ def _read_camera_path(document: JsonReader, size: tuple[int, int] | None) -> Cam
 
 
 def _read_camera_matrix(record: JsonReader, key: str) -> Tensor:
-    """Read a (4, 4) matrix from field ``key``, given as 16 numbers row by row or as four rows."""
+    """Read a (4, 4) matrix from field ``key``, given as 16 numbers in row-major order, or as 3 or 4 rows."""
     value = record.values.get(key)
     if isinstance(value, list) and len(value) == 16:
         return JsonReader({key: [value[i : i + 4] for i in (0, 4, 8, 12)]}, record.where).matrix(key)
@@ -184,7 +188,7 @@ _UNEQUAL_SCALES = 1e-3  # largest relative deviation of a pose's axis scales fro
 
 
 def is_usd(path: Path) -> bool:
-    """Return whether the first bytes of a file are those of one of the three USD formats."""
+    """Return whether a file begins like a USD file: as text (usda), binary (usdc) or a zip archive (usdz)."""
     try:
         with open(path, "rb") as file:
             return file.read(8).startswith(_USD_MAGIC)
@@ -193,12 +197,12 @@ def is_usd(path: Path) -> bool:
 
 
 def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = None) -> CameraViews:
-    """Read one camera of a USD stage; a moving camera is read at every whole time code.
+    """Read one camera of a USD stage: one view per whole time code if the camera moves, else one view.
 
-    ``prim`` is the path of the camera, required if the stage has several cameras. Axes and units are those of the
+    ``prim`` is the prim path of the camera, required if the stage has several cameras. Axes and units are those of the
     stage. ``size`` is (width, height) in pixels; None uses the size in the stage's render settings. The image shows the
-    whole aperture ("expandAperture" of UsdRender). Raises DataError for unreadable stages, orthographic or sheared
-    cameras, or if no size is known.
+    whole aperture ("expandAperture" of UsdRender). Raises DataError for unreadable stages, orthographic cameras, poses
+    with shear or unequal scales, or if no size is known.
     """
     if importlib.util.find_spec("pxr") is None:
         raise BackendUnavailable(f"{path}: USD files need the package usd-core: pip install 'neuprim[usd]'")
@@ -221,7 +225,7 @@ def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = 
 
 
 def _read_usd_stage(path: Path, prim: str) -> JsonReader:
-    """Run the USD reader in a separate process and return the JSON that it printed."""
+    """Run ``usd_stage.py`` for camera ``prim`` of a file in a separate process; return the JSON object it prints."""
     if path.stat().st_size > _MAX_USD_BYTES:
         raise DataError(f"{path}: {path.stat().st_size} bytes; expected at most {_MAX_USD_BYTES}")
     # -P: pxr must not import modules from the script's folder
@@ -269,7 +273,7 @@ def _usd_camera(record: JsonReader, size: tuple[int, int]) -> Camera:
 
 
 def _remove_pose_scale(matrix: Tensor, where: str) -> Tensor:
-    """Return a camera pose without its uniform scale; raise DataError if the axes differ in scale."""
+    """Remove the uniform scale from a (4, 4) camera-to-world pose; raise DataError if the scales of its axes differ."""
     lengths = matrix[:3, :3].norm(dim=0)
     mean = lengths.mean()
     if not bool(mean > 0) or float((lengths / mean - 1).abs().max()) > _UNEQUAL_SCALES:

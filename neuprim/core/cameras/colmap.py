@@ -1,4 +1,7 @@
-"""Read COLMAP's sparse models with pycolmap. Binary files are checked first, as pycolmap hangs on damaged counts."""
+"""Read COLMAP's sparse models with the package pycolmap.
+
+Binary files are checked before pycolmap reads them, because pycolmap hangs on files with damaged counts of records.
+"""
 
 from __future__ import annotations
 
@@ -104,7 +107,10 @@ def colmap_viewmat(image: Any) -> Tensor:
 
 
 def largest_colmap_model(project: Path) -> tuple[Path | None, str]:
-    """Return the folder of the model with most images in the project's ``sparse``, or None, and a message, or ""."""
+    """Find the COLMAP model with the most images in the folder ``sparse`` of a project.
+
+    Returns the folder of the model, None if there is no model, and a message if there are several models, else "".
+    """
     place = project / "sparse"
     models = sorted(
         (p for p in place.glob("*") if _colmap_model_suffix(p) is not None), key=lambda p: (len(p.name), p.name)
@@ -120,7 +126,7 @@ def largest_colmap_model(project: Path) -> tuple[Path | None, str]:
 
 
 def _count_colmap_images(model: Path) -> int:
-    """Return the number of images in a model's images file without reading them; 0 if it is missing."""
+    """Count a COLMAP model's images from its images file without decoding them; 0 if the file is not readable."""
     try:
         if (model / "images.bin").is_file():
             with open(model / "images.bin", "rb") as file:
@@ -132,7 +138,10 @@ def _count_colmap_images(model: Path) -> int:
 
 
 def find_colmap_model(path: Path) -> Path | None:
-    """Return the folder of the COLMAP model if ``path`` is that folder, one of its files, or a project; else None."""
+    """Return the folder of the COLMAP model to which ``path`` leads; None if it leads to no model.
+
+    ``path`` may be the folder, a file of the model, or a project: a folder whose subfolder ``sparse`` holds models.
+    """
     if path.is_dir():
         return path if _colmap_model_suffix(path) is not None else largest_colmap_model(path)[0]
     is_part = path.suffix in (".txt", ".bin") and path.stem in _PARTS
@@ -140,7 +149,11 @@ def find_colmap_model(path: Path) -> Path | None:
 
 
 def read_colmap_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[str]]:
-    """Return (image name without suffix, camera) pairs of all posed images, by name, and messages for the user."""
+    """Return the pinhole cameras of all posed images of a COLMAP model, and messages for the user.
+
+    The cameras are pairs (image name without suffix, camera), sorted by name. Lens distortion is left out, with a
+    message. Raises DataError for a damaged model, an unsupported camera model, or no posed image.
+    """
     reconstruction = _read_colmap_cameras_only(folder)
     images = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
     if not images:
@@ -162,11 +175,11 @@ def read_colmap_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[st
         if count
     ]
     several = largest_colmap_model(folder.parent.parent)[1] if folder.parent.name == "sparse" else ""
-    return found, notes + [several.replace("takes", "the largest is")] * bool(several)
+    return found, notes + [several] * bool(several)
 
 
 def _read_colmap_cameras_only(folder: Path) -> Any:
-    """Read a COLMAP model, also if the file of its 3D points is missing."""
+    """Return the ``pycolmap.Reconstruction`` of a COLMAP model, even if the model's file of 3D points is missing."""
     kind = _colmap_model_suffix(folder)
     if kind is None or (folder / f"points3D{kind}").is_file() or not (folder / f"images{kind}").is_file():
         return read_colmap_model(folder)
@@ -197,7 +210,7 @@ class _ColmapRecordReader:
         self.at = 0
 
     def skip(self, size: int) -> int:
-        """Advance by ``size`` bytes and return the position before."""
+        """Advance the read position by ``size`` bytes; return the position before, in bytes from the file's start."""
         start, self.at = self.at, self.at + size
         if size < 0 or self.at > len(self.data):
             found = f"a record ends at byte {self.at}, but the file at byte {len(self.data)}"
@@ -216,7 +229,8 @@ class _ColmapRecordReader:
 def check_binary_colmap_model(folder: Path, parameter_count: Callable[[int], int]) -> None:
     """Check all ``.bin`` files of a model record by record; raise DataError for a damaged file.
 
-    ``parameter_count`` maps the number of a camera model to its number of parameters, -1 if unknown.
+    ``parameter_count`` maps COLMAP's number of a camera model to the count of the model's lens parameters; -1 stands
+    for an unknown model.
     """
     records = (lambda file: _skip_camera(file, parameter_count), _skip_image, _skip_point, _skip_rig, _skip_frame)
     for part, skip_record in zip(_PARTS, records, strict=True):

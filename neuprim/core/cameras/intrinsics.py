@@ -1,15 +1,16 @@
-"""Read intrinsics, lenses and other keys of ``transforms.json`` files, for data loaders and camera files.
+"""Read intrinsics, lenses and other keys of ``transforms.json`` files, for loaders of data sets and of cameras.
 
 Focal lengths: ``fl_x fl_y`` in pixels, ``camera_angle_x camera_angle_y`` in radians, ``x_fov y_fov`` in degrees, or
 ``camera_intrinsics`` [cx, cy, fx, fy]. Principal point: ``cx cy``. Size: ``w h``. Lens: ``camera_model``,
 ``is_fisheye``, ``k1 k2 k3 k4 p1 p2``.
 
-A *record* is the JSON object of a frame or of the file.
+A *record* is the JSON object of a frame or of the whole file. A *group* is the keys for the focal length, the
+principal point, the lens model or the distortion.
 
 * All keys of a group come from the frame if it has any of them, else from the file.
 * Keys of one record that state the same quantity must agree within 1 %.
 * Lengths in pixels refer to the image size in their own record. They are scaled if the image is a resized copy.
-* A key that changes the picture is read or refused by name. Unknown keys are named once in a warning.
+* A key that changes the image, and that neuprim cannot apply, raises a DataError. Unknown keys are listed in a warning.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ class CameraTarget:
 
 @dataclass(frozen=True)
 class _IntrinsicsSource:
-    """JSON fields of a frame or of the whole file, and the image size to which their pixel lengths refer."""
+    """A JSON object with intrinsics (a frame or the whole file), and the image size for which its lengths hold."""
 
     record: JsonReader
     size: tuple[int, int]
@@ -63,7 +64,10 @@ class _IntrinsicsSource:
         return any(self.record.has(key) for key in group)
 
     def scales(self, keys: str, target: CameraTarget) -> tuple[float, float]:
-        """Return how many target pixels correspond to one pixel of this image size: (horizontally, vertically)."""
+        """Return (x, y) factors that convert lengths from pixels of this record to pixels of the target image.
+
+        ``keys`` names the lengths in errors. Raises DataError unless the target is a resized copy of this image size.
+        """
         if not is_resized_camera_size(self.size, target.size):
             own, other = _format_camera_image_size(self.size), _format_camera_image_size(target.size)
             found = f"{keys} are for images of {own} (w, h), but the image is {other}"
@@ -77,7 +81,7 @@ def _format_camera_image_size(size: tuple[int, int]) -> str:
 
 
 def is_resized_camera_size(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Return whether one image size is the other one scaled, up to rounding to whole pixels."""
+    """Return whether two image sizes (width, height) have the same aspect ratio, up to rounding to whole pixels."""
     scale = max(other[0] / size[0], other[1] / size[1])
     return abs(size[0] * scale - other[0]) <= 1.0 and abs(size[1] * scale - other[1]) <= 1.0
 
@@ -96,8 +100,9 @@ def read_camera(
 ) -> Camera:
     """Read the pinhole camera of a frame; keys that the frame lacks are read from ``file``.
 
-    ``viewmat`` (4, 4) is world to camera, OpenCV axes; None reads ``transform_matrix``. ``say`` is called with messages
-    for the user. Raises DataError for missing or wrong fields, or fields that contradict each other or the image.
+    ``file`` is the JSON object of the whole file, ``target`` the image of the camera. ``viewmat`` (4, 4) is world to
+    camera, OpenCV axes; None reads ``transform_matrix``. ``say`` is called with messages for the user. Raises DataError
+    for missing or wrong fields, or fields that contradict each other or the size of the image.
     """
     of_file = _IntrinsicsSource(file, _stated_image_size(file, target.size))
     of_frame = _IntrinsicsSource(frame, _stated_image_size(frame, of_file.size))
@@ -119,7 +124,7 @@ def read_camera(
 
 
 def _stated_image_size(record: JsonReader, default: tuple[int, int]) -> tuple[int, int]:
-    """Return the image size in the keys w and h of a JSON object; a missing one comes from ``default``."""
+    """Return (width, height) from the keys w and h of a JSON object; ``default`` replaces missing keys."""
     return record.count("w") if record.has("w") else default[0], record.count("h") if record.has("h") else default[1]
 
 
@@ -129,7 +134,7 @@ def _stated_image_size(record: JsonReader, default: tuple[int, int]) -> tuple[in
 def _read_focal_lengths(
     frame: JsonReader, level: _IntrinsicsSource, target: CameraTarget, say: Say
 ) -> tuple[float, float]:
-    """Return fx, fy in pixels of the target image; raise DataError if keys contradict each other."""
+    """Return (fx, fy) in target pixels from ``level``, the frame or the file; raise DataError if keys disagree."""
     x, y = _stated_camera_focal_lengths(level, 0, target), _stated_camera_focal_lengths(level, 1, target)
     if not x and not y:
         keys = "camera_angle_x (radians), fl_x (pixels), camera_intrinsics or x_fov (degrees)"
@@ -173,7 +178,10 @@ def _read_focal_lengths(
 
 
 def _stated_camera_focal_lengths(level: _IntrinsicsSource, axis: int, target: CameraTarget) -> dict[str, float]:
-    """Return key -> focal length in target pixels, for each key that states it along ``axis``; pixel keys first."""
+    """Return the focal length along ``axis`` (0: x, 1: y), by the name of each key that states it.
+
+    Focal lengths are in pixels of the target image. Keys in pixels come before keys that state a field of view.
+    """
     record, name, side = level.record, "xy"[axis], target.size[axis]
     found = {}
     if record.has(key := f"fl_{name}"):
@@ -192,7 +200,7 @@ def _stated_camera_focal_lengths(level: _IntrinsicsSource, axis: int, target: Ca
 
 
 def _read_camera_intrinsics(record: JsonReader) -> list[float]:
-    """Return [cx, cy, fx, fy] of ``camera_intrinsics``, pixels."""
+    """Return the key ``camera_intrinsics`` as [cx, cy, fx, fy] in pixels; raise DataError unless fx, fy > 0."""
     values: list[float] = record.array("camera_intrinsics", (4,), "[cx, cy, fx, fy] in pixels").tolist()
     if not (values[2] > 0 and values[3] > 0):
         expected = "[cx, cy, fx, fy] with focal lengths above 0"
@@ -210,7 +218,7 @@ def _focal_lengths_agree(a: float, b: float) -> bool:
 def _read_principal_point(
     frame: _IntrinsicsSource, file: _IntrinsicsSource, focal: _IntrinsicsSource, target: CameraTarget
 ) -> tuple[float, float]:
-    """Return cx, cy in pixels of the target; the middle of the image if no key states them."""
+    """Return the principal point in target pixels, by default the image centre; ``focal`` states the focal lengths."""
     array = focal.record.has("camera_intrinsics")
     level = frame if frame.has(PRINCIPAL_POINT) else focal if array else file
     array = array and level is focal
@@ -237,7 +245,11 @@ def _read_principal_point(
 def _check_principal_point(
     where: str, keys: str, point: tuple[float, float], stated: bool, target: CameraTarget
 ) -> None:
-    """Raise DataError for a principal point outside the image, or in the middle of an image of another size."""
+    """Raise DataError for an implausible principal point (cx, cy) in pixels of the target image.
+
+    A point is implausible if it lies outside the image or is a fraction of the image size. If no image size is
+    ``stated``, so is the centre of an image of another size. Errors name the JSON object ``where`` and its ``keys``.
+    """
     (cx, cy), image = point, f"{target.image or 'the picture'} ({target.width}x{target.height})"
     kx, ky = 2.0 * cx / target.width, 2.0 * cy / target.height
     if not stated and min(kx, ky) > 0.0 and abs(kx - 1.0) > 0.05 and abs(kx - ky) <= 2 * _TOLERANCE * kx:
@@ -257,7 +269,10 @@ def _check_principal_point(
 
 
 def _check_one_lens(frame: _IntrinsicsSource, file: _IntrinsicsSource, target: CameraTarget) -> None:
-    """Raise DataError for a frame with its own focal length but principal point or distortion from the file."""
+    """Raise DataError if a frame's focal length differs from that of the file, which gives the rest of the lens.
+
+    The rest is the principal point and the distortion. An image centre and zero coefficients are accepted.
+    """
     if file.record.has("camera_intrinsics") or not file.has(FOCAL):
         return
     left = []
@@ -281,13 +296,13 @@ def _check_one_lens(frame: _IntrinsicsSource, file: _IntrinsicsSource, target: C
 
 
 def read_lens_coefficients(frame: JsonReader, file: JsonReader) -> dict[str, float]:
-    """Read the distortion coefficients by name; 0 where none is given."""
+    """Return k1 to k4, p1, p2 by name: those of the frame if it has any, else those of the file; 0 for missing ones."""
     record = _record_with_camera_keys(COEFFICIENTS, frame, file)
     return {key: record.number_or(key, 0.0) for key in COEFFICIENTS}
 
 
 def has_fisheye_lens(frame: JsonReader, file: JsonReader, others: tuple[str, ...] = ("OPENCV_FISHEYE",)) -> bool:
-    """Return whether the lens is OpenCV's fisheye; raise DataError for a lens model that is neither that nor a pinhole.
+    """Return whether the lens is OpenCV's fisheye; raise DataError for a model that is neither fisheye nor pinhole.
 
     ``others`` are further lens models that the error message lists as valid.
     """
@@ -344,7 +359,7 @@ _REFUSED = {
     "normal_mts_args": "Mitsuba's axes; expected OpenGL's, x right, y up, z backward",
     "driver_parameters": "a light of its own in every frame; expected task=relight scene=olat, with pl_pos",
 }
-"""Keys that change the picture if they are set, and what they state."""
+"""Unsupported keys that change the image if they are set -> what each key describes, for the error message."""
 
 _KINDS = ("camera_type", "lens_model", "distortion_model", "projection")
 _ELSEWHERE = {"time": "task=dynamic scene=multiview reads it", "pl_pos": "task=relight scene=olat reads it"}
@@ -366,12 +381,12 @@ def refuse_unsupported_camera_keys(record: JsonReader) -> None:
 
 
 def _is_camera_key_set(value: Any) -> bool:
-    """Return whether a JSON value is set: not null, false, empty, zero, or a list of such values."""
+    """Return whether a JSON value is set: not null, false, zero, empty, or a list of such values only."""
     return any(map(_is_camera_key_set, value)) if isinstance(value, list) else bool(value)
 
 
 def describe_unknown_camera_keys(file: JsonReader, frames: Iterable[JsonReader], read: Iterable[str]) -> str:
-    """Return a message that names the keys neither read nor known to be harmless; "" if there are none."""
+    """Return a warning with all keys that are neither known nor in ``read``, the loader's own keys; "" without any."""
     known = _READ | _HARMLESS | _REFUSED.keys() | {*_KINDS, *read}
     found = dict.fromkeys(k for k in file.values if k not in known)
     found.update(dict.fromkeys(f"frames[].{k}" for r in frames for k in r.values if k not in known))

@@ -1,6 +1,6 @@
-"""Cameras: pinholes, and other central projections by one direction per pixel.
+"""Pinhole cameras, and other central projections that are given as one ray direction per pixel.
 
-OpenCV axes (x right, y down, z forward), world-to-camera matrices, pixel centres at +0.5.
+Camera axes are OpenCV's (x right, y down, z forward). View matrices are world to camera. Pixel centres are at +0.5.
 """
 
 from __future__ import annotations
@@ -35,27 +35,27 @@ class Camera:
 
     @property
     def K(self) -> Tensor:
-        """Intrinsics, (3, 3) float64, pixels."""
+        """Intrinsic matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], (3, 3) float64, in pixels."""
         return torch.tensor([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
     def resized(self, width: int, height: int) -> Camera:
-        """Return the same view with another image size."""
+        """Return this camera for another image size in pixels; the intrinsics scale with width and height."""
         sx, sy = width / self.width, height / self.height
         return Camera(self.viewmat, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, width, height)
 
     def reduced(self, factor: int) -> Camera:
-        """Return the camera for pixels ``factor`` times as large; columns and rows left over are cut off."""
+        """Return this camera with pixels ``factor`` times as wide and high; remaining columns and rows are cut off."""
         fx, fy, cx, cy = (value / factor for value in (self.fx, self.fy, self.cx, self.cy))
         return Camera(self.viewmat, fx, fy, cx, cy, self.width // factor, self.height // factor)
 
     def strided(self, stride: int, column: int, row: int) -> Camera:
-        """Return a camera with the rays of every ``stride``-th pixel in x and y, from (``column``, ``row``) on."""
+        """Return the camera whose rays are those of every ``stride``-th pixel in x and y, from (column, row) on."""
         cx, cy = ((c - first - 0.5) / stride + 0.5 for c, first in ((self.cx, column), (self.cy, row)))
         width, height = -(-(self.width - column) // stride), -(-(self.height - row) // stride)
         return Camera(self.viewmat, self.fx / stride, self.fy / stride, cx, cy, width, height)
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (N, 2) pixels and (N,) depths of (N, 3) points, float64; pixels are valid for depth > 0."""
+        """Project (N, 3) points; return (N, 2) pixels (x, y), valid for depth > 0, and (N,) depths along z, float64."""
         view = self.viewmat.double()
         x, y, z = (points.double() @ view[:3, :3].T + view[:3, 3]).unbind(-1)
         return torch.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], dim=-1), z
@@ -66,7 +66,7 @@ class Camera:
         return (z > 0) & (pixels >= 0).all(1) & (pixels < torch.tensor([self.width, self.height])).all(1)
 
     def validate(self, where: str) -> Camera:
-        """Return this camera; raise DataError naming ``where`` if it is non-finite, singular, scaled or mirrored."""
+        """Return this camera; raise DataError naming ``where`` for invalid intrinsics, image size or view matrix."""
         numbers = torch.tensor([self.fx, self.fy, self.cx, self.cy], dtype=torch.float64)
         if not (torch.isfinite(numbers).all() and self.fx > 0 and self.fy > 0):
             found = f"intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}"
@@ -78,7 +78,7 @@ class Camera:
 
 
 def check_viewmat(viewmat: Tensor, where: str) -> None:
-    """Raise DataError naming ``where`` unless ``viewmat`` is finite, (4, 4), and has a rotation in its upper left."""
+    """Raise DataError naming ``where`` unless ``viewmat`` is finite, (4, 4), and its upper left (3, 3) a rotation."""
     view = viewmat.detach().double().cpu()
     if view.shape != (4, 4) or not torch.isfinite(view).all():
         found = f"camera matrix has shape {tuple(view.shape)} or non-finite entries"
@@ -93,7 +93,10 @@ def check_viewmat(viewmat: Tensor, where: str) -> None:
 
 
 def opengl_to_viewmat(c2w: Tensor) -> Tensor:
-    """Return the (4, 4) world-to-camera OpenCV matrix of a camera-to-world matrix of OpenGL or Blender."""
+    """Convert a camera-to-world matrix with OpenGL axes to a world-to-camera matrix with OpenCV axes, both (4, 4).
+
+    OpenGL and Blender cameras have x right, y up, z backward; OpenCV's have x right, y down, z forward.
+    """
     c2w = c2w.double()
     flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
     c2w_cv = c2w @ flip
@@ -104,7 +107,7 @@ def opengl_to_viewmat(c2w: Tensor) -> Tensor:
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
-    """Return the (4, 4) world-to-camera OpenCV matrix of a camera at ``eye`` looking at ``target``, ``up`` upwards."""
+    """Return the (4, 4) world-to-camera matrix, OpenCV axes, at ``eye`` looking at ``target``, with ``up`` upwards."""
     eye, target, up = eye.double(), target.double(), up.double()
     z = target - eye
     z = z / z.norm()
@@ -127,7 +130,10 @@ def horizontal_axes(up: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def orbit(template: Camera, center: Tensor, up: Tensor, radius: float, elevation: float, count: int) -> list[Camera]:
-    """Return ``count`` copies of ``template`` around ``center``, at distance ``radius``, ``elevation`` radians up."""
+    """Return ``count`` copies of ``template`` on a circle around ``center``, all looking at ``center``.
+
+    ``radius`` is their distance from ``center``. ``elevation`` is their angle above the horizontal plane, in radians.
+    """
     up = (up / up.norm()).double()
     a, b = horizontal_axes(up)
     views = []
@@ -156,12 +162,12 @@ class CameraViews:
 
 
 def camera_exr_attributes(camera: Camera, near: float) -> dict[str, Any]:
-    """Return the standard camera attributes of an OpenEXR file by name.
+    """Return header attributes, by name, that describe a camera in an OpenEXR file.
 
-    The attributes are ``worldToCamera``, ``worldToNDC``, ``screenWindowCenter`` and ``screenWindowWidth``. The matrices
-    multiply row vectors, in a left-handed space with y up and z forward; device coordinates run from (0, 0) at the
-    upper left to (1, 1). neuprim adds ``neuprim:worldToCamera`` in float64, ``neuprim:focalLength`` and
-    ``neuprim:principalPoint`` (x, y, pixels), and ``neuprim:near``.
+    The standard attributes are ``worldToCamera``, ``worldToNDC``, ``screenWindowCenter`` and ``screenWindowWidth``. The
+    matrices multiply row vectors, in a left-handed space with y up and z forward; device coordinates run from (0, 0) at
+    the upper left to (1, 1). neuprim adds ``neuprim:worldToCamera`` in float64, ``neuprim:focalLength`` and
+    ``neuprim:principalPoint`` (x, y, pixels), and ``neuprim:near``, the depth of the near plane.
     """
     view = camera.viewmat.detach().double().cpu().numpy()
     up = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -193,11 +199,12 @@ _UNIT = 1e-6  # how far from 1 a direction's length may be: float32 rounding pas
 
 @dataclass(frozen=True)
 class RayCamera:
-    """A camera with one direction per pixel, such as a fisheye or a panorama; only the reference backend renders it.
+    """A camera with one ray direction per pixel, such as a fisheye or a panorama.
 
-    All rays start at one point; they may point backwards (z < 0). Distances along the rays replace depths: for
-    ``near``, depth images and the order of primitives. So where the near plane cuts a primitive, the image differs from
-    that of a pinhole. Raises DataError if ``viewmat`` is not rigid, or directions are not of unit length.
+    Only the backend ``reference`` renders it. All rays start at one point; they may point backwards (z < 0). The near
+    distance, depth images and the order of primitives use distances along the rays, where a pinhole uses depths along
+    z. So the image differs from a pinhole's where the near distance cuts a primitive. Raises DataError if ``viewmat``
+    is not a rotation and a translation, or directions are not of unit length.
     """
 
     viewmat: Tensor  # (4, 4) world to camera, OpenCV axes
@@ -230,8 +237,9 @@ class RayCamera:
 
     @classmethod
     def fisheye(cls, width: int, height: int, viewmat: Tensor, fov_degrees: float = 180.0) -> RayCamera:
-        """Return an equidistant fisheye whose shorter side spans ``fov_degrees``, at most 360.
+        """Return a fisheye camera whose shorter image side spans ``fov_degrees``, at most 360.
 
+        The fisheye is equidistant: a ray's angle to the axis is proportional to its distance from the image centre.
         Pixels beyond 180 degrees off the axis have no ray. Raises DataError for an impossible size or field of view.
         """
         _check_ray_camera_size("fisheye", width, height)
@@ -266,7 +274,7 @@ def _check_ray_camera_size(name: str, width: int, height: int) -> None:
 
 
 def _pixel_centre_grid(width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Return (y, x) of the pixel centres, each (H, W), float64."""
+    """Return the coordinates y and x of all pixel centres, each (H, W) float64, in pixels."""
     ys, xs = torch.arange(height, dtype=torch.float64) + 0.5, torch.arange(width, dtype=torch.float64) + 0.5
     y, x = torch.meshgrid(ys, xs, indexing="ij")
     return y, x

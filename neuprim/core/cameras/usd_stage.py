@@ -1,6 +1,7 @@
 """Script that prints the camera of a USD stage as JSON; runs in a separate process, without any import of neuprim.
 
-Arguments: file, the camera's prim or nothing, limit on the number of frames. Errors are one line on standard error.
+Command-line arguments: the file, the prim path of the camera ("" for the only camera), and the largest number of
+frames. An error is printed as one line on standard error.
 """
 
 from __future__ import annotations
@@ -14,7 +15,12 @@ MEMORY = 4 << 30  # limit of the process in bytes, as a file may claim any size
 
 
 def read_usd_camera(path: str, wanted: str, most: int) -> dict[str, Any]:
-    """Return ``{"frames": [...], ...}``, which :mod:`neuprim.core.cameras.camera_files` reads."""
+    """Read one camera of the USD stage ``path`` as a JSON object, for :mod:`neuprim.core.cameras.camera_files`.
+
+    Keys: ``path``, ``frames`` (one per time code), ``fps``, ``up``, ``meters`` (per unit) and ``resolution``.
+    ``wanted`` is the camera's prim path, "" for the only camera; ``most`` limits the number of frames. Raises
+    SystemExit with an error message.
+    """
     from pxr import Tf, Usd, UsdGeom
 
     try:
@@ -46,7 +52,11 @@ def read_usd_camera(path: str, wanted: str, most: int) -> dict[str, Any]:
 
 
 def usd_camera_times(stage: Any, camera: Any, most: int, Usd: Any, UsdGeom: Any) -> list[Any]:
-    """Return all whole time codes if the camera moves, else only the stage's start, else the earliest time."""
+    """Return the time codes at which to read a camera; raise SystemExit if they are more than ``most``.
+
+    A moving camera is read at every step of 1 from the stage's start to its end. A camera at rest is read once: at the
+    stage's start, or at the earliest time if the stage has no time range. ``Usd`` and ``UsdGeom`` are modules of pxr.
+    """
     prim, moves = camera.GetPrim(), any(a.ValueMightBeTimeVarying() for a in camera.GetPrim().GetAttributes())
     while not moves and prim and not prim.IsPseudoRoot():
         moves, prim = (
@@ -66,7 +76,7 @@ def usd_camera_times(stage: Any, camera: Any, most: int, Usd: Any, UsdGeom: Any)
 
 
 def usd_camera_frame(camera: Any, moment: Any) -> dict[str, Any]:
-    """Return the camera at time ``moment``: pose (camera to world, column vectors), focal length and aperture."""
+    """Return projection, (4, 4) camera-to-world pose for column vectors, focal length and aperture at ``moment``."""
     found = camera.GetCamera(moment)
     matrix = found.transform
     return {
@@ -79,7 +89,7 @@ def usd_camera_frame(camera: Any, moment: Any) -> dict[str, Any]:
 
 
 def usd_camera_resolution(stage: Any) -> list[int] | None:
-    """Return [width, height] of the stage's render settings, or None."""
+    """Return the image size [width, height] in pixels from the stage's render settings; None without a size."""
     from pxr import UsdRender
 
     settings = UsdRender.Settings.GetStageRenderSettings(stage)

@@ -1,4 +1,4 @@
-"""The transform between a scene and the world of the user's files."""
+"""Transform between the coordinates of the user's files (world) and those of the model (scene)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class World:
 
     @staticmethod
     def at(origin: Sequence[float]) -> World:
-        """Return the world whose point ``origin`` is the scene's origin, with the same axes and units."""
+        """Return the transform that moves the world point ``origin`` to the scene's origin; axes and units stay."""
         matrix = torch.eye(4, dtype=torch.float64)
         matrix[:3, 3] = -torch.tensor(origin, dtype=torch.float64)
         return World(matrix)
@@ -58,7 +58,7 @@ class World:
 
     @cached_property
     def inverse(self) -> World:
-        """The inverse transform, which exchanges world coordinates and scene coordinates."""
+        """The inverse transform, a World whose methods ``scene_...`` convert from scene to world coordinates."""
         back = torch.eye(4, dtype=torch.float64)
         back[:3, :3] = torch.linalg.inv(self.scene_from_world[:3, :3])
         back[:3, 3] = -back[:3, :3] @ self.scene_from_world[:3, 3]
@@ -70,13 +70,13 @@ class World:
         return self.inverse.scene_from_world
 
     def scene_points(self, points: Tensor) -> Tensor:
-        """Return (..., 3) world points as float64 scene points; the identity returns the same tensor."""
+        """Convert (..., 3) points from world to scene coordinates, float64; the identity returns the same tensor."""
         if self.identity:
             return points
         return points.double() @ self.scene_from_world[:3, :3].T + self.scene_from_world[:3, 3]
 
     def world_points(self, points: Tensor) -> Tensor:
-        """Return (..., 3) scene points as world points; the identity returns the same tensor."""
+        """Convert (..., 3) points from scene to world coordinates, float64; the identity returns the same tensor."""
         return self.inverse.scene_points(points)
 
     def scene_camera(self, camera: _Camera) -> _Camera:
@@ -94,11 +94,11 @@ class World:
         return self.inverse.scene_camera(camera)
 
     def world_box(self, box: np.ndarray) -> np.ndarray:
-        """Return the smallest (2, 3) box along the world axes around a ``box`` (2, 3) in scene coordinates."""
+        """Return the smallest (2, 3) box along the world axes around a (2, 3) ``box`` along the scene axes."""
         return self.inverse.scene_box(box)
 
     def scene_box(self, box: np.ndarray) -> np.ndarray:
-        """Return the smallest (2, 3) box along the scene axes around a ``box`` (2, 3) in world coordinates."""
+        """Return the smallest (2, 3) box along the scene axes around a (2, 3) ``box`` along the world axes."""
         if self.identity:
             return box
         corners = np.stack(np.meshgrid(*np.asarray(box, np.float64).T, indexing="ij"), -1).reshape(-1, 3)
@@ -111,7 +111,11 @@ class World:
 
     @staticmethod
     def of(header: Mapping[str, Any], where: str) -> World:
-        """Return the transform in a model's header, else the identity with +z up; raise DataError if it is damaged."""
+        """Return the transform that a model's ``header`` stores; the identity if it stores none.
+
+        The upward direction comes from the header, too, else it is +z. Raises DataError, which names the file
+        ``where``, if the header is damaged.
+        """
         record, facts = header.get("world"), header.get("data")
         world = World()
         if isinstance(facts, dict) and "up" in facts:

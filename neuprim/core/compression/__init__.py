@@ -1,1 +1,1 @@
-"""Quantized models in ``.neuprim`` files."""
+"""Compression of models: quantization and ``.neuprim`` files."""

@@ -1,4 +1,7 @@
-"""Encode a model for a file, ``Primitives`` -> quantizers -> codes -> sections, and quantize it in training."""
+"""Quantize models: encode them as the sections of a ``.neuprim`` file, and simulate quantization in training.
+
+A quantizer converts numbers to integer codes of a few bits. A section of the file holds the codes of one parameter.
+"""
 
 from __future__ import annotations
 
@@ -87,7 +90,7 @@ def canonical_model(model: Primitives) -> Primitives:
 
 
 def fit_quantizers(model: Primitives, table: BitTable) -> Quantizers:
-    """Return a quantizer for each parameter of a canonical model: ranges from its values, bits from the table."""
+    """Return a quantizer for each parameter of a canonical model: ranges fit the values, bits are from ``table``."""
     found: Quantizers = {}
     sparse = _sparse_quantized_parameters(model)
     for spec in model.specs:
@@ -146,7 +149,8 @@ def fit_quantizers_to_error(model: Primitives, effects: Mapping[str, Tensor], er
 
 
 def _even_position_quantizer(x: Tensor, steps: Tensor) -> ColumnQuantizer:
-    """Return a quantizer of positions as :func:`columns_of_step` does, but with the same bits for all three axes."""
+    """Return a quantizer of positions ``x`` (N, 3) with step lengths ``steps`` (3,), as :func:`columns_of_step` does,
+    but with the same number of bits for all axes."""
     own = columns_of_step(x, steps, x.double().mean(0) if len(x) else 0.0)
     bits = int(own.bits.max())
     low = own.low.double()
@@ -163,7 +167,8 @@ def _sparse_quantized_parameters(model: Primitives) -> set[str]:
 
 
 def _fit_position_quantizer(model: Primitives, x: Tensor, bits: int, exact: bool) -> ColumnQuantizer:
-    """Return a quantizer that clips no position ``x``. Unless ``exact``, distant primitives raise ``bits`` for all."""
+    """Return a quantizer whose range contains all positions ``x`` (N, 3). Unless ``exact``, ``bits`` is raised, up to
+    20, until a step is at most 1/50 of the median longest semi-axis."""
     if model.count and not exact:
         width = (x.amax(0) - x.amin(0)).double().max()
         size = model.params["log_scales"].double().amax(1).exp().median()
@@ -204,7 +209,8 @@ def encode_sections(model: Primitives, made: Quantizers) -> list[CompressedSecti
 def _sparse_column_masks(
     model: Primitives, made: Quantizers, codes: Mapping[str, Tensor]
 ) -> tuple[list[np.ndarray], dict[str, list[int]]]:
-    """Return masks of units that are zero in some primitives, and parameter -> mask number of each column (0: none)."""
+    """Return (N,) bool masks of the primitives in which a unit is not zero, and the mask number of each column. Masks
+    exist only for units that are zero in enough primitives. Numbers are by parameter and count from 1; 0: no mask."""
     shapes = {spec.name: spec.shape for spec in model.specs}
     zero = {
         n: (s.values(codes[n]) == 0).reshape(model.count, *shapes[n])

@@ -1,7 +1,8 @@
-"""Read and write ``.neuprim`` files: a JSON header, a table of sections, and their bytes compressed by zstd.
+"""Read and write ``.neuprim`` files: a JSON header, a table of sections, and the sections, compressed by zstd.
 
-Little-endian; docs/data_formats.md describes every byte. Files may be hostile: every size is checked against the file
-size before memory is allocated, and :data:`MAX_EXPANSION` limits decompression.
+A section holds one parameter, the bit masks or the configuration. docs/data_formats.md describes every byte; numbers
+are little-endian. Files may be hostile: every size is checked against the file size before memory is allocated, and
+:data:`MAX_EXPANSION` limits decompression.
 """
 
 from __future__ import annotations
@@ -55,7 +56,11 @@ _MAX_SECTIONS, _MAX_DIMENSIONS, _MAX_COLUMNS, _MAX_PRIMITIVES = 4096, 4, 2**20, 
 
 @dataclass(frozen=True)
 class _TableEntry:
-    """Row of a file's table: section without its content, size of the content, packing, stored size, checksum."""
+    """Row of a file's table, which describes one section; sizes are in bytes.
+
+    ``section`` is still without content. ``content`` is the size of its planes when unpacked, ``packing`` 0 (plain) or
+    1 (zstd). ``stored`` is its size in the file, and ``checksum`` the CRC-32 of these bytes.
+    """
 
     section: CompressedSection
     content: int

@@ -31,12 +31,15 @@ _MANTISSA = 24  # bits of a float32
 _LARGEST = float(torch.finfo(torch.float32).max)
 
 CLIPS = (0.0, 1e-4, 1e-3, 1e-2)
-"""Candidate shares of a column's values to clip at either end; the one with the least mean squared error is used."""
+"""Candidate fractions of a column's values to clip at either end; the one with the least mean squared error is used."""
 
 
 @dataclass(frozen=True)
 class ColumnQuantizer:
-    """Uniform quantizer of C columns, of ``bits`` (C,) int64 each, from ``low`` to ``high``, both (C,) float32."""
+    """Uniform quantizer of C columns (a column has one number per primitive) with ``bits`` bits per number, (C,) int64.
+
+    Codes 0 to 2^bits - 1 stand for even steps from ``low`` to ``high``, (C,) float32.
+    """
 
     bits: Tensor
     low: Tensor
@@ -67,7 +70,7 @@ class ColumnQuantizer:
 
 
 def fit_columns(x: Tensor, bits: Sequence[int], clips: Sequence[float] = CLIPS) -> ColumnQuantizer:
-    """Fit ``low`` and ``high`` of each column to x (N, C), which must be finite and on the CPU.
+    """Return a quantizer whose ``low`` and ``high`` fit each column of x (N, C), finite and on the CPU.
 
     ``clips`` are fractions of the values to try to clip at each end; each column takes the one of least error.
     """
@@ -90,8 +93,8 @@ def fit_columns(x: Tensor, bits: Sequence[int], clips: Sequence[float] = CLIPS) 
 def columns_of_step(x: Tensor, steps: Tensor, through: Tensor | float) -> ColumnQuantizer:
     """Return a quantizer with step lengths ``steps`` (C,) that covers all of x (N, C), finite, on the CPU.
 
-    Steps that would need more than :data:`MAX_BITS` bits are enlarged. ``through`` (C,) or a number: a value to
-    represent.
+    Steps that would need more than :data:`MAX_BITS` bits are enlarged. ``through``, (C,) or a number, is a value that
+    one of the codes represents.
     """
     if not x.numel():
         return fit_columns(x, [1] * x.shape[1])
@@ -108,7 +111,8 @@ def columns_of_step(x: Tensor, steps: Tensor, through: Tensor | float) -> Column
 
 
 def snap_to_zero(columns: ColumnQuantizer) -> ColumnQuantizer:
-    """Move ``low`` and ``high`` inwards, by at most two steps, so that 0 has a code that decodes to exactly 0."""
+    """Return a quantizer in which 0 has a code that decodes to exactly 0. ``low`` and ``high`` move inwards by at most
+    two steps; a range without 0 is first extended to 0."""
     low, high, last = columns.low.double().clamp(max=0.0), columns.high.double().clamp(min=0.0), columns.last.double()
     width = high - low
     place = -low / torch.where(width > 0, width, 1.0) * last  # position of zero, between two codes
@@ -132,7 +136,8 @@ def _column_quantile(ordered: np.ndarray, q: float) -> np.ndarray:
 
 
 def relative_quantizer_error(x: Tensor, columns: ColumnQuantizer) -> Tensor:
-    """Return (C,) RMS errors, relative to those of as many even steps from -1 to 1 standard deviation."""
+    """Return (C,) RMS quantization errors of the columns of x (N, C), each divided by the error of as many even steps
+    from -1 to 1 standard deviation."""
     y = x.detach().double()
     error = (columns.values(columns.codes(x)).double() - y).square().mean(0).sqrt()
     usual = (y - y.mean(0)).square().mean(0).sqrt() * 2 / columns.last / 12**0.5
@@ -158,8 +163,8 @@ class RotationQuantizer:
     def codes(self, quats: Tensor) -> Tensor:
         """Return (N, 4) int64 codes of wxyz (N, 4): index of the largest component, codes of the others.
 
-        If rounding makes another component as large as the largest, that component is reduced, so that codes are
-        stable.
+        If rounding makes another component as large as the largest, that component is reduced, so that decoding and
+        encoding again returns the same codes.
         """
         q = quats.detach().double()
         q = q / q.abs().amax(1, keepdim=True)  # the square of a tiny norm would underflow
@@ -201,7 +206,7 @@ class RotationQuantizer:
 
     @staticmethod
     def _others(largest: Tensor) -> Tensor:
-        """Return the (N, 3) indices of the components other than ``largest``, ascending."""
+        """Return the (N, 3) indices, ascending, of the quaternion components other than ``largest`` (N,)."""
         first = torch.arange(3, device=largest.device).expand(len(largest), 3)
         return first + (first >= largest[:, None])
 
@@ -243,8 +248,8 @@ LEVELS: dict[int, BitTable] = {
     4: _level_bits(12, 7, 7, 7, 6, 5, 5, 5, 6, 5, others=5),
     5: _level_bits(11, 6, 6, 6, 5, 4, 4, 4, 5, 4, others=4),
 }
-"""Bits by level, from nearly lossless (1) to very small (5). Positions, shapes and gains have more, as images depend on
-them."""
+"""Compression level -> bits of each parameter, from nearly lossless (1) to very small (5). Positions, shapes and gains
+get more bits, because images depend on them."""
 
 DEFAULT_LEVEL = 3
 

@@ -1,4 +1,7 @@
-"""Pack the codes of quantizers into byte planes, and unpack and validate them; little-endian (docs/data_formats.md)."""
+"""Pack the integer codes of quantizers into byte planes, and unpack and validate them (docs/data_formats.md).
+
+Byte plane i of a column holds byte i of all its codes, the lowest byte first.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +66,7 @@ class CompressedSection:
 def pack_section(
     name: str, shape: tuple[int, ...], scheme: ColumnQuantizer | RotationQuantizer, codes: np.ndarray, coding: int
 ) -> CompressedSection:
-    """Return a section that holds codes (N, C) of the quantizer ``scheme``. Position codes must be in file order."""
+    """Return a section that holds codes (N, C) of a quantizer. Those of positions must be in :func:`storage_order`."""
     if isinstance(scheme, RotationQuantizer):
         planes = [
             *_byte_planes(codes[:, 0], 2),
@@ -93,7 +96,8 @@ def pack_sparse_columns(
     mask_of: Sequence[int],
     masks: Sequence[np.ndarray],
 ) -> CompressedSection:
-    """Return a section of codes (N, C). Column i stores the rows in mask number ``mask_of[i]``; number 0: all rows."""
+    """Return a section of codes (N, C) that stores in column i only the primitives in mask number ``mask_of[i]``,
+    counted from 1; 0: all primitives."""
     own = [codes[:, i] if of == 0 else codes[masks[of - 1], i] for i, of in enumerate(mask_of)]
     planes = [plane for column, b in zip(own, scheme.bits.tolist(), strict=True) for plane in _byte_planes(column, b)]
     return CompressedSection(
@@ -108,7 +112,7 @@ def _quantizer_head(scheme: ColumnQuantizer) -> bytes:
 
 
 def _byte_planes(codes: np.ndarray, bits: int) -> list[bytes]:
-    """Return the byte planes of codes, low bytes first."""
+    """Return the byte planes of codes of ``bits`` bits: plane i holds byte i of every code, the lowest byte first."""
     return [
         ((codes >> codes.dtype.type(8 * i)) & codes.dtype.type(255)).astype(np.uint8).tobytes()
         for i in range(_code_byte_count(bits))
@@ -218,7 +222,8 @@ class _PlaneReader:
         self._bytes, self._at = np.frombuffer(content, np.uint8), 0
 
     def codes(self, count: int, bits: int, last: int) -> np.ndarray:
-        """Return the next (count,) int64 codes, each at most ``last``."""
+        """Read the next ``count`` codes of ``bits`` bits as (count,) int64; raise CorruptSection for codes above
+        ``last``."""
         found = np.zeros(count, np.int64)
         if count:
             for i in range(_code_byte_count(bits)):
@@ -259,7 +264,7 @@ def compress_code_planes(planes: Sequence[bytes]) -> bytes:
 
 
 def _plane_runs(planes: Sequence[bytes]) -> list[bytes]:
-    """Join neighbouring planes whose largest codes have the same number of bits."""
+    """Join neighbouring byte planes whose largest bytes have the same number of bits."""
     made: list[list[bytes]] = []
     last = -1
     for plane in planes:

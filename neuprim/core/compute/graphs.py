@@ -1,4 +1,4 @@
-"""CUDA graphs: the launches of a function are recorded once and replayed, which takes the host a few microseconds."""
+"""CUDA graphs: a function's kernel launches are recorded once; a replay takes the host a few microseconds."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from neuprim.core.errors import warn_once
 class GraphRecorder:
     """Records functions that work on a GPU as CUDA graphs; on other devices, the functions are just called.
 
-    The tensors of a function must keep their memory. The first function runs without being recorded, which loads its
-    kernels. If one of its operations waits for the device, which a graph cannot do, nothing is ever recorded.
+    A function's tensors must stay at the same addresses, which its graph uses again. The first function runs once
+    without being recorded, which loads its kernels. If one of its operations waits for the device, which a graph cannot
+    do, nothing is ever recorded.
 
     Args:
         where: device of the functions.
@@ -32,7 +33,7 @@ class GraphRecorder:
         self._pool = torch.cuda.graph_pool_handle() if self._on_gpu else None
 
     def record(self, function: Callable[[], None]) -> Callable[[], None]:
-        """Return a function with the effect of ``function``. Its later calls replay the recorded graph."""
+        """Return a function with the effect of ``function``; a call records a graph, which later calls replay."""
         if not self._on_gpu:
             return function
         replay: list[Callable[[], None]] = []

@@ -44,7 +44,7 @@ def _prefer_wide_vectors() -> None:
 
 
 def _forbid_llvm_interleaving() -> None:
-    """Ask LLVM not to interleave several vectors: summation loops would spill registers."""
+    """Ask LLVM not to interleave several vectors in a loop: loops with sums would spill registers."""
     llvm.set_option("neuprim", "-force-vector-interleave=1")
 
 
@@ -52,7 +52,8 @@ _prefer_wide_vectors()
 _forbid_llvm_interleaving()
 
 FAST = {"nnan", "nsz", "arcp", "contract", "afn", "reassoc"}
-"""LLVM fast-math flags of the pixel kernels. They remove NaN checks, so ``prepare`` checks the rows before."""
+"""LLVM fast-math flags of the pixel kernels. They remove NaN checks, so ``prepare`` checks the numbers of all
+primitives before."""
 
 
 _ROOT = Path(__file__).parents[2]
@@ -110,7 +111,7 @@ _sources_hash = functools.cache(sources_hash)
 
 
 class KernelLocator(getattr(caching, "UserProvidedCacheLocator", object)):  # type: ignore[misc]
-    """Locator of numba's kernel cache whose folder name does not depend on the location of the sources."""
+    """Locator of numba's cache: a kernel's folder name does not depend on where its sources lie."""
 
     @classmethod
     def get_suitable_cache_subpath(cls, py_file: str) -> str:
@@ -132,10 +133,10 @@ def _jit(**options: Any) -> Callable[[Any], Any]:
 
 
 inline = njit(fastmath=FAST, error_model="numpy", forceinline=True)
-"""Decorator of device functions of pixel kernels; ``forceinline`` gives the same bits with a cold and a warm cache."""
+"""Decorator of functions that pixel kernels call; ``forceinline`` gives the same bits with a cold and a warm cache."""
 
 inline_source = njit(fastmath=FAST, error_model="numpy", inline="always")
-"""Decorator that inlines a function into its caller before LLVM: the bits are those of one single function."""
+"""Decorator that inlines a function into its caller before LLVM, so the bits are those of one single function."""
 
 kernel = _jit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)  # decorator of pixel kernels
 
@@ -166,9 +167,10 @@ _SIXTEEN = ir.VectorType(ir.FloatType(), 16)
 
 
 def _borrow_kernel_array(context, array):  # type: ignore[no-untyped-def]
-    """Return a view of an array without reference counting, which is atomic and slow.
+    """Define the numba intrinsic ``borrow_array``: return a view of an array without reference counting.
 
-    The caller must keep the array alive. For a kernel's own array, call :func:`release_array` after the last use.
+    Reference counting is atomic and slow. The caller must keep the array alive. For a kernel's own array, call
+    :func:`release_array` after the last use.
     """
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
@@ -180,7 +182,10 @@ def _borrow_kernel_array(context, array):  # type: ignore[no-untyped-def]
 
 
 def _borrow_kernel_arrays(context, arrays):  # type: ignore[no-untyped-def]
-    """Apply :func:`_borrow_kernel_array` to each array of a NamedTuple; other fields stay as they are."""
+    """Define the numba intrinsic ``borrow_arrays``: return a NamedTuple with each array replaced by a borrowed view.
+
+    See :func:`_borrow_kernel_array`. Fields that are not arrays stay as they are.
+    """
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         parts = []
@@ -198,13 +203,13 @@ def _borrow_kernel_arrays(context, arrays):  # type: ignore[no-untyped-def]
 
 
 def _llvm_vector_pointer(context, builder, signature, arguments, array, index):  # type: ignore[no-untyped-def]
-    """Return a pointer to the 16-float vector that begins at an index of an array argument."""
+    """Return an LLVM pointer to 16 float32 of an array; ``array`` and ``index`` are positions in ``arguments``."""
     data = make_array(signature.args[array])(context, builder, value=arguments[array]).data
     return builder.bitcast(builder.gep(data, [arguments[index]]), _SIXTEEN.as_pointer())
 
 
 def _llvm_copy16(context, target, at, source, first):  # type: ignore[no-untyped-def]
-    """Copy source[first : first + 16] to target[at : at + 16], float32; LLVM alone would copy one by one."""
+    """Define ``copy16``: copy source[first : first + 16] to target[at : at + 16], float32, as one vector."""
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         read, written = (
@@ -217,9 +222,10 @@ def _llvm_copy16(context, target, at, source, first):  # type: ignore[no-untyped
 
 
 def _llvm_compress16(context, array, at, first, flags):  # type: ignore[no-untyped-def]
-    """Move the elements of array[first : first + 16] with a flag != 0 to array[at:], then zeros; return their number.
+    """Define ``compress16``: move those of array[first : first + 16] with a flag != 0 to array[at:].
 
-    All sixteen are read before any is written. If later elements are still needed, ``at`` must be <= ``first``.
+    It returns their number, and fills up with zeros to 16 elements. Flag k of 16 is array[flags + k]. All sixteen
+    elements are read before any is written. If later elements are still needed, ``at`` must be <= ``first``.
     """
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
@@ -249,7 +255,10 @@ def _llvm_compress16(context, array, at, first, flags):  # type: ignore[no-untyp
 
 
 def _release_kernel_array(context, array):  # type: ignore[no-untyped-def]
-    """Do nothing; a call after the last use of a borrowed view keeps numba from freeing the kernel's array earlier."""
+    """Define the intrinsic ``release_array``, which does nothing.
+
+    A call after the last use of a borrowed view keeps numba from freeing the kernel's array earlier.
+    """
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         return context.get_dummy_value()
@@ -285,7 +294,7 @@ def code_cache(folder: Path) -> Path:
 
 
 def folder_weakness(folder: Path) -> str:
-    """Return which other users can change the contents of a folder, as text; "" if none can, and always on Windows."""
+    """Return a text that says which other users can change a folder; "" if none can, and always on Windows."""
     if not hasattr(os, "getuid"):
         return ""
     own = os.getuid()

@@ -1,4 +1,4 @@
-"""Run nogil kernels over a range in parallel; run autograd operations without overhead where no gradient is needed.
+"""Run kernels that release the GIL over a range in parallel; run autograd operations alone where no gradient is needed.
 
 Each chunk of a range writes its own output, so results do not depend on the number of threads.
 """
@@ -63,7 +63,7 @@ def limit_process_threads(threads: int) -> Iterator[None]:
 
 @contextmanager
 def limit_threads(threads: int) -> Iterator[None]:
-    """Make "all cores" mean ``threads`` cores (0: all) inside the block, for all code without a thread setting."""
+    """Let calls inside the block that ask for 0 threads ("all cores") use ``threads`` threads (0: all cores)."""
     token = _limit.set(threads)
     try:
         yield
@@ -72,7 +72,7 @@ def limit_threads(threads: int) -> Iterator[None]:
 
 
 def resolve_threads(threads: int) -> int:
-    """Return the number of threads that :func:`parallel_for` uses if asked for ``threads``."""
+    """Return how many threads :func:`parallel_for` uses if asked for ``threads``; 0 asks for all cores or the limit."""
     return threads or _limit.get() or core_count()
 
 
@@ -117,7 +117,7 @@ def parallel_for(function: Callable[..., Any], count: int, chunk: int, threads: 
 
 
 class _ForwardKernelContext:
-    """Stand-in for an autograd context if no backward pass follows; ignores what the forward pass saves."""
+    """Replacement of an autograd context if no backward pass follows; ignores what the forward pass saves."""
 
     def save_for_backward(self, *tensors: Tensor) -> None:
         pass
@@ -132,7 +132,7 @@ def kernel_needs_grad(*arguments: Any) -> bool:
 
 
 def apply_kernel_operation(operation: type[torch.autograd.Function], *arguments: Any) -> Any:
-    """Return ``operation.apply(*arguments)``; run its forward pass alone if no gradient is needed."""
+    """Return ``operation.apply(*arguments)``; if no gradient is needed, run only its forward pass, without autograd."""
     if kernel_needs_grad(*arguments):
         return operation.apply(*arguments)
     return operation.forward(_ForwardKernelContext(), *arguments)

@@ -23,7 +23,8 @@ from neuprim.core.io import files
 BLOCK = 256  # default threads per block
 
 OPTIONS = {"enable_backward": False, "fast_math": False, "max_unroll": 16}
-"""Module options of every kernel: no generated adjoints (ours are written by hand); IEEE division and roots."""
+"""Module options of every kernel. Warp generates no backward kernels, because ours are written by hand; divisions and
+square roots are IEEE."""
 
 FAST = {**OPTIONS, "fast_math": True}
 """Module options of the float32 pixel kernels: approximate division, root and exponential, which a GPU computes to one
@@ -76,7 +77,7 @@ def _kernel_dtype_bytes(dtype: Any) -> int:
 
 
 def _fill_descriptor(given: _KernelArray, into: Any) -> None:
-    """Write a tensor's address, shape and strides into a Warp array descriptor."""
+    """Write a tensor's address, shape and strides into the Warp array descriptor ``into``, for a kernel argument."""
     tensor, whole = given.tensor, _kernel_dtype_bytes(given.dtype)
     assert tensor.is_contiguous(), "arrays of kernels are contiguous"
     shape, size = tensor.shape, tensor.element_size()
@@ -92,7 +93,7 @@ def _fill_descriptor(given: _KernelArray, into: Any) -> None:
 
 
 def _pack_argument(value: Any) -> Any:
-    """Return an argument in the type that Warp expects, in its own memory."""
+    """Return a kernel argument in the type that Warp expects, in memory of its own."""
     if value is None:
         return _Bare()
     if isinstance(value, _KernelArray):
@@ -144,7 +145,7 @@ def _device_stream_of_torch(device: torch.device) -> Any:
 def launch_kernel(
     kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], device: torch.device, block: int = BLOCK
 ) -> None:
-    """Run a kernel on torch's current stream; do nothing if a ``dim`` is 0."""
+    """Run a kernel with ``dim`` threads per axis on torch's current stream; do nothing if a ``dim`` is 0."""
     if not wp.config.enable_cpu_blocks:
         raise RuntimeError("Warp runs blocks on the CPU as single threads: wp.config.enable_cpu_blocks was turned off")
     dims = (dim,) if isinstance(dim, int) else tuple(dim)

@@ -1,4 +1,4 @@
-"""Data sets as the trainer uses them, and the common code of loaders of posed images."""
+"""Data sets for training, and code that all loaders of posed images share."""
 
 from neuprim.core.data.dataset import (
     Clip,

@@ -1,4 +1,4 @@
-"""Data sets: posed images that load on demand, starting points, known volume points, and the scene's coordinates."""
+"""Data sets: posed images that load on demand, starting points for primitives, and points with ground truth."""
 
 from __future__ import annotations
 
@@ -38,12 +38,13 @@ def _composite_pixels(rgb, alpha, out, background):  # type: ignore[no-untyped-d
 
 
 Correction = Literal["pose", "offset", "factor"]
-"""What training learns for an uncertain input: a camera's pose, an offset of a position (scene units), or a factor."""
+"""Correction that training learns for an uncertain input: a camera's pose, an offset added to a position (scene units),
+or a factor on a value."""
 
 
 @dataclass(frozen=True)
 class View:
-    """A view without its pixels: name, camera and conditions."""
+    """A view without its pixels: name, camera and conditions (further inputs of the image, such as the time)."""
 
     name: str  # unique within its split; used for file names and reports
     camera: Camera
@@ -119,7 +120,7 @@ class ViewSubset(ViewSet):
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points where training may start primitives."""
+    """Points where training may place its first primitives (ellipsoids), perhaps with sizes and opacities."""
 
     means: Tensor  # (N, 3) positions, scene units; float64 world units before within() converts them
     colors: Tensor  # (N, C) in the data set's colour space
@@ -131,13 +132,13 @@ class PointCloud:
     steps: Mapping[str, float] = field(default_factory=dict)  # condition -> step between neighbouring frames
 
     def rows(self, index: Tensor) -> PointCloud:
-        """Return the points at (M,) int64 or (N,) bool ``index``."""
+        """Return the points that ``index`` selects: (M,) int64 row numbers, or an (N,) bool mask."""
         values = {name: getattr(self, name) for name in ("means", "colors", "axes", "quats", "alphas", "deviations")}
         chosen = {name: value[index] for name, value in values.items() if value is not None}
         return replace(self, **chosen, conditions={n: value[index] for n, value in self.conditions.items()})
 
     def within(self, world: World) -> PointCloud:
-        """Return the points converted from ``world`` coordinates to scene coordinates, in float64."""
+        """Return the points converted from world to scene coordinates: computed in float64, returned as float32."""
         means = world.scene_points(self.means).float()
         scale, quats = world.scale, self.quats
         axes, deviations = (x if x is None or scale == 1.0 else x * scale for x in (self.axes, self.deviations))
@@ -150,7 +151,7 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class Clip:
-    """A film that shows views one after the other."""
+    """A video that shows views of a view set in a given order."""
 
     name: str
     views: Sequence[int]  # indices into source, in the order of the film
@@ -166,7 +167,7 @@ generator alone."""
 @final
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Dataset:
-    """The data of a scene to train on: views, starting points and properties. Subclasses are refused."""
+    """The data of a scene to train on: views, starting points and properties. Subclassing raises TypeError."""
 
     name: str  # shown in reports
     train: ViewSet  # training views
@@ -198,7 +199,7 @@ class Dataset:
         )
 
     def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
-        """Return at most ``count`` distinct starting points."""
+        """Return at most ``count`` distinct points where training starts primitives, found by :attr:`start`."""
         return self.start(self.train, count, generator)
 
     def uniform_points(self, count: int, generator: torch.Generator) -> PointCloud:
@@ -211,10 +212,11 @@ class Dataset:
         return PointCloud(means, torch.full((count, self.channels), 0.5))
 
     def orbit(self, frames: int) -> list[View]:
-        """Return views on a circle at the mean distance and elevation of the training cameras.
+        """Return ``frames`` views on a circle around :attr:`center`, for a video.
 
-        The views look outward if the training cameras do. Conditions that are one number run from their lowest to their
-        highest training value; other conditions keep the value of the first view.
+        The circle has the mean distance and elevation of the training cameras. The views look outward if the training
+        cameras do. Conditions that are one number run from their lowest to their highest training value; other
+        conditions keep the value of the first view.
         """
         cameras = [self.train.view(i).camera for i in range(len(self.train))]
         far = find_outliers(torch.stack([c.position for c in cameras]))
@@ -261,21 +263,21 @@ class PointSamples:
 
 
 class PointSupervision(ABC):
-    """Base class of objects that draw points with known ground truth, see :attr:`Dataset.points`."""
+    """Base class of objects that draw points of a volume with ground truth, to train on points besides images."""
 
     components: tuple[str, ...] = ()  # names of the source grids in PointSamples.components
 
     @abstractmethod
     def draw(self, count: int, generator: torch.Generator) -> PointSamples:
-        """Return ``count`` points of one frame; random numbers come from ``generator`` alone."""
+        """Draw ``count`` points, with ground truth, of one frame; random numbers come from ``generator`` alone."""
 
 
 def hold_out_views(dataset: Dataset, every: int) -> Dataset:
     """Return the data set with one of every ``every`` training views moved to a new test split.
 
-    The position of the moved view advances by one from each group of ``every`` views to the next. So every time step of
-    a multi-camera sequence keeps some training cameras. The old test split is dropped. Raises ConfigError: ``every`` <
-    2, or fewer than two training views.
+    One view of each group of ``every`` consecutive views is moved. Its position in the group advances by one from group
+    to group, so every time step of a multi-camera sequence keeps some training cameras. The old test split is dropped.
+    Raises ConfigError: ``every`` < 2, or fewer than two training views.
     """
     count = len(dataset.train)
     if every < 2 or count < 2:
@@ -287,7 +289,7 @@ def hold_out_views(dataset: Dataset, every: int) -> Dataset:
 
 
 class DatasetImages(ABC):
-    """Base class of images that a scene renders frame by frame, perhaps in several processes."""
+    """Base class of the images of a data set that neuprim renders itself, frame by frame, in one or more processes."""
 
     frames: Sequence[str]  # names of the frames, in order
     key: str  # hash of everything the images depend on; all processes must agree on it
@@ -331,7 +333,7 @@ class SceneContext:
 def camera_extent(cameras: Sequence[Camera]) -> float:
     """Return 1.1 times the largest distance of a camera from the mean camera centre; 1.0 if the distance is 0.
 
-    Outliers are ignored.
+    Cameras far from all others (:func:`find_outliers`) are ignored.
     """
     positions = torch.stack([c.position.detach().double() for c in cameras])
     positions = positions[~find_outliers(positions)]
@@ -344,14 +346,21 @@ _OUTLYING_SHARE = 0.05
 
 
 def find_outliers(positions: Tensor) -> Tensor:
-    """Return (N,) bool: centres beyond 100 median distances from the median; none if more than max(1, N/20) are."""
+    """Return (N,) bool: which of the camera centres ``positions`` (N, 3) are outliers.
+
+    Distances are measured from the median of the centres. An outlier is more than 100 median distances away. If more
+    than max(1, N/20) centres are, none counts as an outlier.
+    """
     distance = (positions - positions.median(0).values).norm(dim=-1)
     far = (distance > _OUTLYING * distance.median()) & (distance.median() > 0)
     return far if int(far.sum()) <= max(1, _OUTLYING_SHARE * len(far)) else torch.zeros_like(far)
 
 
 def dataset_focus_point(cameras: Sequence[Camera]) -> Tensor:
-    """Return the (3,) float64 point nearest to all optical axes, drawn weakly to one extent ahead of the cameras."""
+    """Return the (3,) float64 point with the least mean squared distance from the cameras' optical axes.
+
+    A weak penalty pulls the point towards one :func:`camera_extent` in front of the mean camera.
+    """
     positions, forward = _dataset_optical_axes(cameras)
     eye = torch.eye(3, dtype=torch.float64)
     planes = eye - forward[:, :, None] * forward[:, None, :]
@@ -362,10 +371,11 @@ def dataset_focus_point(cameras: Sequence[Camera]) -> Tensor:
 
 
 def dataset_axes_meet(cameras: Sequence[Camera]) -> bool:
-    """Return whether the optical axes determine a point in front of the cameras.
+    """Return whether the cameras look at a common point.
 
-    The axes must pass the point within half the spread of the camera centres. Also, 9 of 10 cameras must look towards
-    it. Parallel axes, outward rings and tripods determine no point.
+    The axes' RMS distance from that point must be below half the cameras' RMS distance from their mean. At least 9 of
+    10 cameras must have the point in front of them. Parallel axes, rings of cameras that look outward, and cameras at
+    one position (tripods) have no common point.
     """
     positions, forward = _dataset_optical_axes(cameras)
     offsets = dataset_focus_point(cameras) - positions
@@ -390,9 +400,9 @@ FAR = 100.0  # camera extents from the origin, beyond which a scene is moved: fl
 def choose_dataset_world(cameras: Sequence[Camera], where: str = "cameras") -> World:
     """Choose the transform between the coordinates of a file (world) and of the scene: identity, or an offset.
 
-    If the mean camera centre is farther than :data:`FAR` extents from the origin, it becomes the scene's origin,
-    rounded to multiples of a power of ten between one and ten extents. Other scenes keep their coordinates bit for bit.
-    ``where`` names the file in warnings.
+    An extent is the :func:`camera_extent`. If the mean camera centre is farther than :data:`FAR` extents from the
+    origin, it becomes the scene's origin, rounded to multiples of a power of ten between one and ten extents. Other
+    scenes keep their coordinates exactly. ``where`` names the file in warnings.
     """
     views = [c.viewmat.detach().double() for c in cameras]
     # solved, not transposed: far from the origin a transpose turns the rounding of a file's rotations into metres

@@ -1,4 +1,4 @@
-"""Checks that a data set follows the rules of :class:`~neuprim.core.data.dataset.Dataset`."""
+"""Check that a data set from a loader follows the rules of :class:`~neuprim.core.data.dataset.Dataset`."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def _check_dataset_tensor(where: str, value: Any, dtype: torch.dtype, shape: tup
 
 
 def _check_finite_dataset_tensor(where: str, value: Any, shape: tuple[int, ...], more: str = "") -> None:
-    """Raise DatasetError unless ``value`` is a finite floating-point tensor of this shape, of any precision."""
+    """Raise DatasetError naming ``where`` unless ``value`` is a finite tensor of ``shape``, of any float precision."""
     if not (isinstance(value, Tensor) and value.is_floating_point() and tuple(value.shape) == shape):
         _refuse_dataset_tensor(where, value, torch.float32, shape, more)
     _check_finite_dataset_values(value, where)

@@ -1,4 +1,4 @@
-"""Posed image files as a view set: decoded on demand, masked, undistorted, down-sampled and cached."""
+"""View sets of posed image files, which are decoded on demand, masked, undistorted, down-sampled and cached."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ __all__ = ["Distortion", "FisheyeDistortion", "ImageFrame", "ImageViews", "Mask"
 
 
 class Distortion(ABC):
-    """Base class of lens distortions; hashable, so that views with the same lens share a resampling grid."""
+    """Base class of lens distortions; instances are hashable, so views with equal lenses share a resampling grid."""
 
     @abstractmethod
     def project(self, points: np.ndarray, camera: Camera) -> np.ndarray:
-        """Return (M, 2) pixels of the photograph for (M, 2) directions (x/z, y/z), float64; pixel centres at +0.5."""
+        """Project (M, 2) directions (x/z, y/z) to (M, 2) pixels of the photograph, float64; pixel centres at +0.5."""
 
 
 @dataclass(frozen=True)
 class RadialDistortion(Distortion):
-    """OpenCV's lens model: radius r times 1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8, and tangential terms p1, p2."""
+    """OpenCV's lens model: radius r times 1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8, plus tangential terms of p1, p2."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -76,10 +76,10 @@ class FisheyeDistortion(Distortion):
 
 
 def undistortion_grid(camera: Camera, distortion: Distortion) -> tuple[Tensor, Tensor]:
-    """Return the positions of the undistorted ``camera``'s pixels in a photograph of the same size, and a mask.
+    """Return where each pixel of the undistorted ``camera`` lies in a distorted photograph of equal size, and a mask.
 
-    Positions are (H, W, 2) float32 pixels (x, y), centres at +0.5. The mask is (H, W) bool: inside the photograph and
-    on the part of the lens around the principal point where the map does not fold over.
+    Positions are (H, W, 2) float32 pixels (x, y), centres at +0.5. The mask is (H, W) bool: True inside the photograph,
+    on the part of the lens around the principal point where the distortion does not fold the image over.
     """
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
@@ -94,7 +94,10 @@ def undistortion_grid(camera: Camera, distortion: Distortion) -> tuple[Tensor, T
 
 
 def _unfolded_pixels(camera: Camera, source: np.ndarray) -> np.ndarray:
-    """Return (H, W) bool: pixels connected to the principal point without crossing a fold of the lens map."""
+    """Return (H, W) bool: pixels connected to the principal point without crossing a fold of the lens distortion.
+
+    ``source`` (H, W, 2) holds the pixels' positions in the photograph. At a fold their order reverses.
+    """
     # polynomial lens models turn back beyond some radius and would mirror the middle of the photograph into the corners
     if min(source.shape[:2]) < 2:
         return np.isfinite(source).all(axis=-1)
@@ -106,7 +109,10 @@ def _unfolded_pixels(camera: Camera, source: np.ndarray) -> np.ndarray:
 
 
 def resample_image(image: Tensor, source: Tensor) -> Tensor:
-    """Return (H', W', C) float32 bilinear samples of (H, W, C) at (H', W', 2) source pixels, clamped to the border."""
+    """Sample an (H, W, C) image bilinearly at the (H', W', 2) pixel positions ``source`` (x, y), centres at +0.5.
+
+    Returns (H', W', C) float32. Positions outside the image are clamped to its border.
+    """
     height, width = image.shape[:2]
     grid = source / torch.tensor([width, height]) * 2.0 - 1.0  # -1 and 1 are the outer edges of the outer pixels
     planes = image.float().permute(2, 0, 1)[None]
@@ -127,10 +133,12 @@ def find_masks(folder: Path, files: Sequence[Path], images: Path | None = None) 
 
     The mask of ``images/a/b.jpg`` is ``masks/a/b.png``, ``masks/a/b.jpg.png`` or ``masks/a/b.jpg`` (COLMAP,
     nerfstudio). For ``images_4``, ``masks_4`` is tried first. ``dynamic_mask_b.png`` next to the image (instant-ngp) is
-    inverted.
+    an inverted mask: its non-zero pixels are ignored.
 
     Args:
-        images: folder of the images; None for the first part of their paths if it begins with "images".
+        folder: folder of the data set.
+        images: folder of the images; None for ``folder``, or its subfolder in an image's path that begins with
+            "images".
     """
     masks = [_find_mask(folder, file, images) for file in files]
     found = [m for m in masks if m is not None]
@@ -158,7 +166,7 @@ def _find_mask(folder: Path, file: Path, images: Path | None) -> Mask | None:
 
 
 def average_pixels(values: Tensor, factor: int) -> Tensor:
-    """Average (H, W, C) over blocks of ``factor`` x ``factor`` pixels: (H // factor, W // factor, C).
+    """Average an (H, W, C) image over blocks of ``factor`` x ``factor`` pixels, to (H // factor, W // factor, C).
 
     Remaining rows and columns are cut off.
     """
@@ -166,7 +174,7 @@ def average_pixels(values: Tensor, factor: int) -> Tensor:
 
 
 def reduce_image_mask(mask: Tensor, factor: int) -> Tensor:
-    """Reduce a mask to (H // factor, W // factor) bool: True where all pixels of a block are True."""
+    """Reduce an (H, W) mask to (H // factor, W // factor) bool: True where all factor x factor pixels are True."""
     return F.avg_pool2d(mask[None].float(), factor)[0] > 0.999
 
 
@@ -206,7 +214,7 @@ def _premultiply_dataset_kernel(rgba, rgb, alpha):  # type: ignore[no-untyped-de
 
 @dataclass(frozen=True)
 class _StoredImage:
-    """Decoded pixels of a view, (H, W, C) uint8, half or float, and the mask of the pixels that count."""
+    """A decoded image: (H, W, C) uint8, half or float, perhaps premultiplied by alpha, and a mask of valid pixels."""
 
     data: Tensor
     premultiplied: bool
@@ -230,7 +238,7 @@ class _StoredImage:
 
     @property
     def alpha(self) -> Tensor | None:
-        """Alpha, (H, W) float32; None for images without."""
+        """Alpha 0..1, (H, W) float32; None if the image has no alpha channel."""
         if self.data.shape[-1] == 3:
             return None
         alpha = self.data[..., 3].float()
@@ -262,13 +270,14 @@ class _StoredImage:
 
 
 class StoredPixels(Pixels):
-    """Pixels of a stored image, converted to floats on first use.
+    """Pixels of a decoded image, mostly 8-bit, that are converted to floats on first use.
 
-    Strided views convert only their own pixels. Reading only alpha converts only alpha. On a GPU, the stored image is
-    not converted in advance either, and takes a quarter of the memory of floats.
+    After :meth:`strided`, only the chosen pixels are converted. Reading only alpha converts only alpha. A copy on a GPU
+    also stays 8-bit until its first use, in a quarter of the memory of floats.
 
     Args:
-        image: the image; None if ``fields`` has the fields of ``Pixels``, as :func:`dataclasses.replace` passes them.
+        image: the decoded image; None if ``fields`` has the fields of ``Pixels``, as :func:`dataclasses.replace`
+            passes them.
     """
 
     image: _StoredImage | None
@@ -301,8 +310,8 @@ class ImageViews(ViewSet):
     Args:
         downsample: factor by which images are reduced; remaining rows and columns are cut off. An image smaller than
             the factor is a ConfigError.
-        cache_bytes: size of the cache, which holds uint8 (PNG, JPEG) or half (OpenEXR).
-        to_linear: convert sRGB files to linear light first.
+        cache_bytes: most bytes of the cache, which holds decoded images as uint8 (PNG, JPEG) or half (OpenEXR).
+        to_linear: convert sRGB files to linear light, before images are undistorted and reduced.
     """
 
     def __init__(
@@ -340,7 +349,10 @@ class ImageViews(ViewSet):
     def preload(
         self, progress: Callable[[float], None] = lambda fraction: None, empty: bool = True
     ) -> dict[int, DataError]:
-        """Decode and cache all images; return view index -> error of bad ones. ``empty`` accepts transparent ones."""
+        """Decode and cache all images; return the error of each damaged image by the index of its view.
+
+        ``progress`` is called with the finished fraction. Unless ``empty``, a fully transparent image is an error.
+        """
 
         def fault(index: int) -> DataError | None:
             try:
@@ -399,7 +411,7 @@ class ImageViews(ViewSet):
         return _StoredImage(image, premultiplied, mask, self._to_linear)
 
     def _resample_frame(self, frame: ImageFrame, image: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """Undistort and down-sample an image and its mask; colours become premultiplied, the dtype stays."""
+        """Undistort and reduce an image and its mask; return premultiplied uint8 for 8-bit sRGB, else float32."""
         eight_bit = image.dtype == torch.uint8
         if eight_bit and self._to_linear:
             values = _LINEAR[image[..., :3].int()]

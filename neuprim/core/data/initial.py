@@ -1,4 +1,4 @@
-"""Starting points: given points, the visual hull of alpha masks, a box in front of the cameras, and surroundings."""
+"""Choose starting points of primitives: given points, or points inferred from alpha masks, cameras and pixels."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def initial_points(views: ViewSet, points: PointCloud | None, count: int, genera
 
     If ``points`` are given, the starting points are drawn from them. Otherwise they are inferred from the images: along
     rays if the cameras do not look at one point, else on the visual hull for images with alpha, else in a box around
-    the focus. If the cameras have different positions, at least two see each inferred point.
+    the point that the cameras look at. If the cameras have different positions, at least two see each inferred point.
 
     Raises:
         ConfigError: ``count`` is not positive.
@@ -50,7 +50,7 @@ def check_point_count(count: int) -> None:
 
 
 def views_have_alpha(views: ViewSet) -> bool:
-    """Return whether one of the first eight views is transparent somewhere."""
+    """Return whether one of the first eight views has a pixel with alpha below 0.5."""
     alphas = (views.pixels(i).alpha for i in range(min(len(views), 8)))
     return any(alpha is not None and bool((alpha < 0.5).any()) for alpha in alphas)
 
@@ -64,7 +64,11 @@ def draw_points(points: PointCloud, count: int, generator: torch.Generator) -> P
 
 
 def hull_points(views: ViewSet, count: int, generator: torch.Generator, resolution: int = 128) -> PointCloud:
-    """Spread ``count`` points over the surface of the visual hull, with sub-voxel jitter and colours of the pixels."""
+    """Spread ``count`` points over the surface of the visual hull of the views' alpha masks.
+
+    The hull has ``resolution`` voxels along its longest side. Points are placed at random in its surface voxels, and
+    get the :func:`median_colors` of the pixels that show them.
+    """
     centers, voxel = hull_surface(views, resolution)
     spread = count <= len(centers)
     rows = farthest_points(centers, count, generator) if spread else torch.arange(count) % len(centers)
@@ -94,7 +98,7 @@ def box_starting_points(views: ViewSet, count: int, generator: torch.Generator) 
 
 
 def drop_repeated_points(points: PointCloud) -> PointCloud:
-    """Remove repeated positions."""
+    """Return the points with distinct positions: the first point at each position."""
     rows = _distinct_point_rows(points)
     return points if len(rows) == len(points.means) else points.rows(rows)
 
@@ -105,7 +109,7 @@ def _distinct_point_rows(points: PointCloud) -> Tensor:
 
 
 def farthest_points(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Choose ``count`` rows of ``points`` (M, 3) that are far from each other; approximate for large sets."""
+    """Return (count,) indices of ``points`` (M, 3) far from each other: farthest-point sampling, or a grid for many."""
     if count * len(points) > _FPS_WORK:
         return _thin_points_by_grid(points, count, generator)
     start = int(torch.randint(len(points), (1,), generator=generator))
@@ -182,10 +186,11 @@ _SHELL = 0.1  # share of the points that surround everything
 
 
 def surrounding_points(views: ViewSet, points: PointCloud, count: int, generator: torch.Generator) -> PointCloud:
-    """Return at most ``count`` points on surroundings that the views show and that ``points`` do not cover.
+    """Return at most ``count`` points for surroundings that the views show but the given ``points`` do not cover.
 
-    Pixels without a point nearby become points, with their colours, at the depth of their neighbours, unless other
-    views already cover the position. A tenth of the points lie on a sphere around the scene, where some view looks.
+    A pixel without a projected point nearby becomes a point of its colour, at the depth of the nearest projected
+    points, unless a point already lies there. A tenth of the points lie on a sphere around the scene, each in the image
+    of some view.
     """
     if count <= 0 or not len(points.means):
         return points.rows(torch.zeros(0, dtype=torch.int64))
@@ -199,7 +204,7 @@ def surrounding_points(views: ViewSet, points: PointCloud, count: int, generator
 
 
 def _lift_starting_points(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:
-    """Turn pixels without nearby points into points; coarse pixel grids first, to fill the largest gaps first."""
+    """Turn pixels with no point of ``given`` (N, 3) nearby into at most ``count`` points, on coarse grids first."""
     order = torch.randperm(len(views), generator=generator)[:_VIEWS].tolist()
     known = given.double().numpy()
     means = np.zeros((0, 3))
@@ -218,7 +223,11 @@ def _lift_starting_points(views: ViewSet, given: Tensor, count: int, generator: 
 def _find_starting_pixels(
     views: ViewSet, index: int, known: NDArray[np.float64], cell: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return positions and colours of grid pixels, ``cell`` apart, that have no known point within ``cell``."""
+    """Return positions (K, 3) and colours (K, C) of new points, from pixels that show no known point.
+
+    Pixels of view ``index`` on a grid of spacing ``cell`` are chosen if no point of ``known`` (N, 3) projects within
+    ``cell`` pixels. Their depth is that of the nearest projected points.
+    """
     camera, image = views.view(index).camera, views.pixels(index)
     rotation, shift = camera.viewmat[:3, :3].double().numpy(), camera.viewmat[:3, 3].double().numpy()
     spots = _starting_pixel_grid(camera.width, camera.height, cell)
@@ -244,14 +253,14 @@ def _find_starting_pixels(
 
 
 def _starting_pixel_grid(width: int, height: int, cell: float) -> NDArray[np.float64]:
-    """Return (N, 2) pixel positions (x, y), about ``cell`` apart."""
+    """Return the (N, 2) pixel positions (x, y) of a regular grid over an image, about ``cell`` pixels apart."""
     across, down = max(round(width / cell), 1), max(round(height / cell), 1)
     x, y = (np.arange(across) + 0.5) * width / across, (np.arange(down) + 0.5) * height / down
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 def _surrounding_shell(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:
-    """Return at most ``count`` points on a sphere around cameras and points, each in the image of some view."""
+    """Return at most ``count`` points on a sphere around cameras and ``given`` points, each in the image of a view."""
     cameras = [views.view(i).camera for i in range(len(views))]
     center = dataset_focus_point(cameras)
     eyes = torch.stack([c.position.double() for c in cameras]) - center

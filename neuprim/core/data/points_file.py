@@ -17,7 +17,7 @@ from neuprim.core.model.sh import C0
 COMPRESSED = (".splat", ".spz", ".ksplat", ".sog", ".sogs", ".lcc")  # refused by name
 
 LINEAR = "colours are linear light"
-"""A comment of files whose colours are not sRGB; ``neuprim export --format gaussian-ply`` writes it."""
+"""Comment that marks PLY files with linear, not sRGB, colours; ``neuprim export --format gaussian-ply`` writes it."""
 
 _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 _SCALES = ("scale_0", "scale_1", "scale_2")
@@ -32,7 +32,8 @@ _COARSE = 1e-3  # coarsest rounding of coordinates without a warning, over the s
 def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
     """Read the vertices of a PLY file as starting points, in the file's own coordinates, ``means`` in float64.
 
-    Colours (``f_dc_0..2``, or ``red green blue``) are taken for sRGB, and become ``channels`` in ``color_space``.
+    Colours (``f_dc_0..2``, or ``red green blue``) are sRGB unless a comment says that they are linear. They are
+    converted to ``color_space`` and ``channels`` channels.
     ``scale_0..2`` with ``rot_0..3`` (wxyz) and ``opacity`` (a logit) make Gaussians; two scales make a disc, one scale
     a ball. Vertices that are no valid points are left out with a warning. Raises DataError for a damaged or compressed
     file, or a file without usable points.
@@ -100,7 +101,7 @@ def _starting_point_columns(found: PlyVertices, names: tuple[str, ...]) -> np.nd
 
 
 def _starting_point_log_sizes(found: PlyVertices, path: Path) -> np.ndarray | None:
-    """Return (N, 3) logarithms of sizes, -inf along the missing axis of discs; None without usable sizes."""
+    """Return (N, 3) logarithms of the Gaussians' sizes, -inf for a disc's missing size; None without usable sizes."""
     there = [name for name in _SCALES if name in found.names]
     if not there:
         return None
@@ -116,7 +117,7 @@ def _starting_point_log_sizes(found: PlyVertices, path: Path) -> np.ndarray | No
 
 
 def _starting_point_colors(found: PlyVertices, path: Path) -> np.ndarray:
-    """Return (N, 3) colours in the file's own colour space, 0..1, or above for brighter light."""
+    """Return the vertices' (N, 3) colours in the file's own colour space, 0..1, or above 1 for brighter light."""
     dc = _starting_point_columns(found, ("f_dc_0", "f_dc_1", "f_dc_2"))
     if dc is not None:
         return dc * C0 + 0.5
@@ -132,7 +133,7 @@ def _starting_point_colors(found: PlyVertices, path: Path) -> np.ndarray:
 
 
 def _warn_of_rounded_starting_points(found: PlyVertices, means: np.ndarray, path: Path) -> None:
-    """Warn where float32 coordinates far from the origin are too coarse for the cloud."""
+    """Warn if a file's float32 coordinates lie so far from the origin that rounding distorts the point cloud."""
     largest = np.abs(means).max(initial=0.0)
     size, step = np.ptp(means, axis=0).max(), np.spacing(np.float32(largest))
     if found.rows.dtype["x"].itemsize == 4 and step > _COARSE * size > 0:

@@ -1,4 +1,4 @@
-"""Data sets of posed image files: common settings, splits, and views that are left out."""
+"""Code that loaders of posed image files share: settings, splits, damaged views, and assembly of the data set."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ _T = TypeVar("_T")
 
 
 class BadImageViews:
-    """Collector of errors of damaged views, which are left out with a warning. If ``strict``, the first is raised."""
+    """Collector of errors of damaged views, which are left out with a warning; if ``strict``, the first is raised."""
 
     def __init__(self, where: str, strict: bool) -> None:
         self._where, self._strict = where, strict
@@ -88,7 +88,7 @@ class BadImageViews:
             self._first = error
 
     def settle(self, count: int) -> None:
-        """Warn of all recorded bad views; raise DataError if they are more than half of ``count`` views."""
+        """Warn of all recorded bad views; raise DataError if they are more than half of all ``count`` views."""
         bad = len(self._faults)
         if 2 * bad > count:
             more = "" if count == 1 else f"; {bad} of {count} views of {self._where} are like this"
@@ -108,8 +108,10 @@ class MissingFiles(DataError):
 
 
 def find_image(folder: Path, text: str) -> Path | None:
-    """Return the image file ``text`` below ``folder``, also if the suffix is missing or upper and lower case differ;
-    None if there is no such file."""
+    """Return the path of the image file ``text`` in ``folder``; None if there is no such file.
+
+    The suffix of ``text`` may be missing, and upper and lower case may differ.
+    """
     text = str(folder / text.replace("\\", "/"))
     try:
         found = next((Path(text + s) for s in ("", *IMAGE_SUFFIXES) if Path(text + s).is_file()), None)
@@ -129,7 +131,7 @@ def _warn_of_images_outside_dataset(where: str, home: Path, paths: Iterable[Path
 
 
 def _find_image_in_other_case(folder: Path, path: Path) -> Path | None:
-    """Return the only file whose path differs from ``path`` in upper and lower case alone, or None."""
+    """Return the file below ``folder`` whose path equals ``path`` but for upper and lower case; None if unclear."""
     if not path.is_relative_to(folder):
         return None
     for part in path.relative_to(folder).parts:
@@ -157,8 +159,9 @@ def missing_dataset_files_error(where: str, names: Sequence[str], hint: str = ""
 
 
 def unique_view_names(paths: Iterable[str], where: str) -> list[str]:
-    """Return a view name per image path: its stem, or the whole path with ``_`` for ``/`` if stems repeat.
+    """Return a view name for each image path: the path's stem (file name without suffix).
 
+    If stems repeat, the names are the whole paths with ``_`` for ``/``, and with the index in front if they repeat.
     Raises DataError if a path occurs twice.
     """
     texts = [p.replace("\\", "/").removeprefix("./") for p in paths]
@@ -206,10 +209,11 @@ def assemble_dataset(
     context: SceneContext,
     details: SceneDetails = SceneDetails(),
 ) -> Dataset:
-    """Return the data set with the given training and test frames.
+    """Make a Dataset of the given training and test frames.
 
     Args:
         where: file or folder that errors name.
+        details: properties of the scene that its file format provides besides the images.
 
     Raises:
         DataError: an empty split, mixed kinds of images, or most images damaged; with ``settings.strict``, any damaged
@@ -283,7 +287,7 @@ def _choose_dataset_background(where: str, background: str, alpha: bool) -> str:
 def _preload_split(
     where: str, images: ImageViews, split: str, strict: bool, empty: bool, progress: Callable[[str, float], None]
 ) -> None:
-    """Decode all images of a split and leave out damaged ones. ``empty`` accepts fully transparent images."""
+    """Decode all images of a split and leave out damaged ones. Unless ``empty``, transparent images are damaged."""
     bad = BadImageViews(f"{where} ({split})", strict)
     faults = images.preload(lambda fraction: progress(f"reading {split} images", fraction), empty)
     for index, error in faults.items():
@@ -293,13 +297,13 @@ def _preload_split(
 
 
 def image_frame_in_scene(frame: ImageFrame, world: World, positions: Sequence[str]) -> ImageFrame:
-    """Convert a frame's camera, and those conditions that are ``positions``, from world to scene coordinates."""
+    """Convert a frame's camera, and the conditions named in ``positions``, from world to scene coordinates."""
     moved = {name: world.scene_points(frame.conditions[name]).float() for name in positions}
     return replace(frame, camera=world.scene_camera(frame.camera), conditions={**frame.conditions, **moved})
 
 
 def _describe_dataset_downsampling(frames: Sequence[ImageFrame], reduced: Camera, factor: int) -> str:
-    """Describe the reduction: "200x200 from 800x800 by area", "1/4 by area" if sizes differ, "" for none."""
+    """Describe how images are reduced: "200x200 from 800x800 by area", "1/4 by area" if sizes differ, "" for none."""
     if factor == 1:
         return ""
     sizes = {(f.info.width, f.info.height) for f in frames}
@@ -310,7 +314,7 @@ def _describe_dataset_downsampling(frames: Sequence[ImageFrame], reduced: Camera
 
 
 def _mean_dataset_up(cameras: Sequence[Camera]) -> Tensor:
-    """Return the (3,) mean of the cameras' upward directions; +z if they cancel."""
+    """Return the (3,) mean of the cameras' upward directions as a unit vector; +z if the directions cancel."""
     up = -torch.stack([c.viewmat[1, :3] for c in cameras]).mean(0)
     if up.norm() < 1e-3:
         up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Starting points inferred from images: on the visual hull of alpha masks, or along rays without a hull."""
+"""Infer starting points of primitives from images: on the visual hull of alpha masks, or on rays through pixels."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class EmptyHull(DataError):
 
 @dataclass(frozen=True)
 class _Silhouette:
-    """A mask's camera, and the (H+1, W+1) int32 summed-area table of pixels that may show matter."""
+    """Camera of an alpha mask, and the (H+1, W+1) int32 summed-area table of its pixels that may show matter."""
 
     camera: Camera
     table: Tensor
@@ -35,7 +35,7 @@ class _Silhouette:
 
 @dataclass(frozen=True)
 class _VoxelGrid:
-    """Cubic voxels: lower corner (3,), side, and (X, Y, Z) bool of the voxels that remain."""
+    """Cubic voxels: lower ``corner`` (3,), side ``voxel``, and ``full`` (X, Y, Z) bool, False where carved away."""
 
     corner: Tensor
     voxel: float
@@ -51,8 +51,8 @@ def hull_surface(
     """Return centres (M, 3) float32 of the visual hull's surface voxels, and the side of a voxel, in scene units.
 
     ``resolution`` is in voxels along the hull's longest side. A voxel belongs to the hull under two conditions. At
-    least the fraction ``seen_views`` of the views contains it. At most the fraction ``wrong_views`` of the views has an
-    alpha there of at most ``matter``. Raises EmptyHull if the hull has no voxel.
+    least the fraction ``seen_views`` of the views has it in the image. At most the fraction ``wrong_views`` of the
+    views shows only alpha of at most ``matter`` there. Raises EmptyHull if the hull has no voxel.
     """
     silhouettes = _read_silhouettes(views, matter)
     cameras = [s.camera for s in silhouettes]
@@ -70,7 +70,10 @@ def hull_surface(
 
 
 def _read_silhouettes(views: ViewSet, threshold: float) -> list[_Silhouette]:
-    """Return the masks of evenly spaced views, ordered so that consecutive views look from different sides."""
+    """Return the alpha masks of at most 100 evenly spaced views; pixels with alpha above ``threshold`` show matter.
+
+    Consecutive masks are from different sides of the scene. Large masks are reduced.
+    """
     chosen = sorted(evenly_spaced(len(views), _VIEWS), key=lambda i: i * 0.6180339887 % 1.0)
     found = []
     for index in chosen:
@@ -89,7 +92,7 @@ def _read_silhouettes(views: ViewSet, threshold: float) -> list[_Silhouette]:
 
 
 def _refine_voxels(grid: _VoxelGrid, resolution: int) -> _VoxelGrid:
-    """Subdivide the box of the remaining voxels to ``resolution`` voxels along its longest side."""
+    """Return a finer grid of the box around the remaining voxels: ``resolution`` voxels along its longest side."""
     cells = grid.full.nonzero()
     low, high = cells.min(0).values, cells.max(0).values + 1
     voxel = grid.voxel * float((high - low).max()) / resolution
@@ -105,7 +108,11 @@ def _refine_voxels(grid: _VoxelGrid, resolution: int) -> _VoxelGrid:
 def _carve_voxels(
     grid: _VoxelGrid, silhouettes: list[_Silhouette], reach: float, seen_views: float, wrong_views: float
 ) -> _VoxelGrid:
-    """Remove voxels that the masks rule out. Each test covers a cube of half side ``reach``, in voxels."""
+    """Remove the voxels that do not belong to the visual hull; raise EmptyHull if none remains.
+
+    A mask is searched for matter where a cube of half side ``reach``, in voxels, around the voxel's centre projects.
+    ``seen_views`` and ``wrong_views`` are as in :func:`hull_surface`.
+    """
     cells = grid.full.nonzero()
     poses = torch.stack([s.camera.viewmat[:3].double() for s in silhouettes]).numpy()
     cameras = [s.camera for s in silhouettes]
@@ -131,11 +138,12 @@ def _carve_voxels(
 def _carve_hull_points(
     points: Any, poses: Any, lenses: Any, offsets: Any, tables: Any, reach: float, allowed: int, needed: float
 ) -> Any:
-    """Return (M,) bool: points inside ``needed`` or more images, and without matter in at most ``allowed`` of them.
+    """Return (M,) bool: which points lie in at least ``needed`` images, at most ``allowed`` of which show no matter.
 
     ``points`` are (M, 3). For V views, ``poses`` (V, 3, 4) are world to camera, and ``lenses`` (V, 6) hold fx, fy, cx,
     cy, width and height. All are float64. The summed-area table (height+1, width+1) of view j begins at
-    ``tables[offsets[j]]``. The projection of a cube around each point, of half side ``reach``, is searched for matter.
+    ``tables[offsets[j]]``. The projection of a cube around each point, of half side ``reach``, is searched for matter:
+    pixels that the alpha mask marks as opaque.
     """
     keep = np.zeros(len(points), dtype=np.bool_)
     for i in range(len(points)):
@@ -180,7 +188,7 @@ _ROUNDS = 8
 
 
 def count_seeing_views(views: ViewSet, means: Tensor) -> Tensor:
-    """Return (N,) int64 counts of the views whose images contain each of the points (N, 3), among at most 100 views."""
+    """Count the views (of at most 100) in whose image each of the points (N, 3) lies, (N,) int64; ignores occlusion."""
     return torch.stack([views.view(i).camera.sees(means) for i in evenly_spaced(len(views), _VIEWS)]).sum(0)
 
 
@@ -189,10 +197,11 @@ def ray_starting_points(
 ) -> tuple[PointCloud, Tensor]:
     """Place at most ``count`` points on rays through random pixels, uniform in 1/z, with the colours of the pixels.
 
-    Returns the points, and the (N,) indices of the views that they come from. Depths range over those at which other
-    views show the same colours. If no depth fits better than infinity, all cameras are taken to be at one position, and
-    the unit of depth is arbitrary. Otherwise at least two cameras must see each point. Only pixels with alpha above
-    ``matter`` are used. Raises DataError: no two cameras see the same position, or no pixel has enough alpha.
+    Returns the points, and the (N,) indices of the views whose pixels they come from. Depths z lie in the range where
+    other views show the same colours. If no depth fits better than infinity, all cameras are taken to be at one
+    position, and the unit of depth is arbitrary. Otherwise at least two cameras must see each point. Only pixels with
+    alpha above ``matter`` are used. Raises DataError: no two cameras see the same position, or no pixel has enough
+    alpha.
     """
     depths, mean, needed = _find_starting_depths(views, generator, matter)
     found: list[tuple[Tensor, Tensor, Tensor]] = []
@@ -220,14 +229,18 @@ def ray_starting_points(
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:
-    """Return at most ``most`` evenly spaced indices below ``count``."""
+    """Return at most ``most`` evenly spaced indices, from 0 to ``count`` - 1."""
     return sorted({round(i * (count - 1) / max(min(count, most) - 1, 1)) for i in range(min(count, most))})
 
 
 def _draw_starting_pixels(
     views: ViewSet, count: int, generator: torch.Generator, matter: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Draw pixels with matter; return ray origins and directions (N, 3) float64, colours (N, C), view indices (N,)."""
+    """Draw ``count`` random pixels of the views, and keep valid ones with alpha above ``matter``.
+
+    Returns ray origins and directions (N, 3) float64, colours (N, C) and view indices (N,). Directions have
+    z = 1 in camera axes.
+    """
     drawn = torch.randint(len(views), (count,), generator=generator)
     spots = torch.rand((count, 2), generator=generator).double()
     found = []
@@ -249,7 +262,11 @@ def _draw_starting_pixels(
 
 
 def _find_starting_depths(views: ViewSet, generator: torch.Generator, matter: float) -> tuple[Tensor, Tensor, int]:
-    """Return plausible depths, the mean colour difference at each, and the number of cameras that must see a point."""
+    """Find the range of depths at which starting points may lie, from how well the views' colours agree.
+
+    Returns (D,) depths from near to far, in scene units, the (D,) mean colour difference between views at each, and
+    the number of cameras (1 or 2) that must see a point. ``matter`` is the least alpha of the pixels compared.
+    """
     cameras = [views.view(i).camera for i in range(len(views))]
     same = all(torch.equal(c.position, cameras[0].position) for c in cameras)
     unit = camera_extent(cameras)
@@ -273,7 +290,11 @@ def _find_starting_depths(views: ViewSet, generator: torch.Generator, matter: fl
 
 
 def _starting_color_difference(views: ViewSet, points: Tensor, colors: Tensor, owner: Tensor) -> Tensor:
-    """Return (N,) median differences between ``colors`` and other views at the points; NaN if no view shows a point."""
+    """Return how much the colours of other views at (N, 3) points differ from ``colors``: the (N,) median over views.
+
+    ``owner`` (N,) is the index of the view that a point comes from, which is not compared. The result is NaN for points
+    in no other view.
+    """
     found = []
     for index in evenly_spaced(len(views), _OTHERS):
         camera, pixels = views.view(index).camera, views.pixels(index)

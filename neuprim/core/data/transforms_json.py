@@ -1,7 +1,7 @@
-"""Frames of ``transforms.json`` files: cameras, lenses, masks and splits.
+"""Read the frames of ``transforms.json`` files: cameras, lenses, masks and splits.
 
-The reader accepts files of instant-ngp, nerfstudio, BlenderNeRF, NeRF-synthetic, D-NeRF, NRHints and GS³. Intrinsics
-and other keys: :mod:`neuprim.core.cameras.intrinsics`. Poses are camera to world with OpenGL axes.
+The reader accepts files of instant-ngp, nerfstudio, BlenderNeRF, NeRF-synthetic, D-NeRF, NRHints and GS³.
+:mod:`neuprim.core.cameras.intrinsics` reads intrinsics and lenses. Poses are camera to world with OpenGL axes.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def _image_frame_viewmat(record: JsonReader) -> Tensor:
 
 @dataclass(frozen=True)
 class TransformsLayout:
-    """Description of one format of ``transforms.json``: how it differs from the other formats."""
+    """Description of one variant of the ``transforms.json`` format: how to find a frame's image, pose and mask."""
 
     keys: tuple[str, ...] = ()  # further keys that the loader reads
     name: Callable[[JsonReader], str] = _image_frame_path  # path of a frame's image, as the file states it
@@ -70,7 +70,7 @@ def read_image_frames(
     layout: TransformsLayout,
     skip_missing: bool = False,
 ) -> tuple[list[JsonReader], list[ImageFrame]]:
-    """Read frames; return the JSON objects and the image frames of all good ones, in the order of ``records``.
+    """Read frames; return the JSON objects and the image frames of all undamaged ones, in the order of ``records``.
 
     ``document`` is the whole file; its fields apply to ``records`` (frames) that lack them. Paths are relative to
     ``folder``. ``skip_missing`` leaves out frames whose image is missing, unless no frame would remain. Raises
@@ -128,7 +128,7 @@ def _is_image_pose_damaged(record: JsonReader) -> bool:
 
 
 def _image_pose_numbers(value: object) -> list[float]:
-    """Return all numbers in nested lists."""
+    """Return all numbers of a JSON value of nested lists, in one list; huge integers become infinity."""
     if isinstance(value, list):
         return [n for item in value for n in _image_pose_numbers(item)]
     if isinstance(value, int) and not isinstance(value, bool):
@@ -139,7 +139,11 @@ def _image_pose_numbers(value: object) -> list[float]:
 def _find_frame_masks(
     folder: Path, document: JsonReader, present: Sequence[tuple[JsonReader, Path]], layout: TransformsLayout
 ) -> list[Mask | None]:
-    """Return the mask or None of every frame: ``mask_path`` of the frame or file, else a mask next to the images."""
+    """Return the mask, or None, of each frame in ``present``, pairs of a JSON object and its image file.
+
+    Masks are named by ``mask_path`` in the frame or the file. Without this key, some layouts search for masks next to
+    the images. Raises MissingFiles if a named mask does not exist.
+    """
     if layout.masks and not any(r.has("mask_path") for r in (document, *(r for r, _ in present))):
         return find_masks(folder, [file for _, file in present])
     masks, lost = [], []
@@ -155,7 +159,7 @@ def _find_frame_masks(
 
 
 def _read_distortion(record: JsonReader, document: JsonReader, fisheye: bool) -> Distortion | None:
-    """Return the lens distortion of a frame; None for a lens that is not a fisheye and has only zero coefficients."""
+    """Return the lens distortion of a frame; None for a pinhole, which has only zero coefficients."""
     lens = read_lens_coefficients(record, document)
     k, p = [lens[f"k{i}"] for i in (1, 2, 3, 4)], [lens["p1"], lens["p2"]]
     if fisheye:
@@ -166,7 +170,11 @@ def _read_distortion(record: JsonReader, document: JsonReader, fisheye: bool) ->
 def read_image_splits(
     folder: Path, train: str, test: str, hold_out: int, read: Callable[[str], list[ImageFrame]]
 ) -> tuple[list[ImageFrame], list[ImageFrame]]:
-    """Read (training, test) frames of ``transforms_SPLIT.json``; ``hold_out=n`` makes every n-th view a test view."""
+    """Return the (training, test) frames of a data set with one file ``transforms_SPLIT.json`` per split.
+
+    ``train`` and ``test`` name the splits, and ``read`` returns the frames of a split. If ``hold_out`` is not 0, every
+    ``hold_out``-th training view becomes a test view, and the split ``test`` is not read.
+    """
     frames = read(train)
     if hold_out:
         if len(frames) < 2:
@@ -186,7 +194,7 @@ def read_image_splits(
 def split_named_images(
     document: JsonReader, records: Sequence[JsonReader], frames: Sequence[ImageFrame], every: int
 ) -> tuple[list[ImageFrame], list[ImageFrame]]:
-    """Split frames into (training, test) by the lists of names in the file, else every n-th is a test view.
+    """Split frames into (training, test) by lists of names in the file; without lists, every n-th is a test view.
 
     Test views are those in ``test_filenames``, else those in ``val_filenames``, else all views that are not training
     views. Training views are those in ``train_filenames``, else all views that no list names. Validation views are

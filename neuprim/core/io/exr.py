@@ -1,4 +1,4 @@
-"""Read and write OpenEXR files with any named channels. Written files use lossless ZIP compression, atomically.
+"""Read and write OpenEXR files with any named channels. Files are written atomically, with lossless ZIP compression.
 
 Channels without a prefix are the image (R, G, B and premultiplied A). A prefix and a dot name a layer, e.g.
 ``depth.Z``.
@@ -23,7 +23,7 @@ from neuprim.core.io.files import checked_atomic_path
 __all__ = ["ExrChannel", "exr_channels", "read_exr", "write_exr", "write_exr_layers"]
 
 MAX_PIXELS = 64 * 2**20
-"""Most pixels of an image (8192 x 8192). Larger ones are refused before pixel memory is allocated."""
+"""Largest number of pixels of an image (8192 x 8192). Larger images are refused before memory is allocated."""
 
 _MAX_VALUES = 16 * MAX_PIXELS  # most values of all channels of a file, which are decoded together
 _MAX_HALF = 65504.0
@@ -55,7 +55,7 @@ def default_exr_channel_names(count: int) -> tuple[str, ...]:
 
 
 def exr_channel_name_error(names: Sequence[Any]) -> str | None:
-    """Return ``"PROBLEM; expected ..."`` for the first channel name that is invalid or ambiguous, else None."""
+    """Return a message ``[INDEX] PROBLEM; expected ...`` for the first invalid or repeated channel name, else None."""
     used: set[str] = set()
     for i, name in enumerate(names):
         if not isinstance(name, str):
@@ -94,7 +94,11 @@ def exr_channels(path: Path) -> tuple[str, ...]:
 
 
 def read_exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[list[str], int, int]:
-    """Return channel names, width and height of ``wanted``, or of the only RGB(A) layer; raise DataError."""
+    """Return the names of the channels to read from an OpenEXR file, and the image's width and height in pixels.
+
+    The names are ``wanted``. None stands for R, G, B and, if present, A: without a prefix, else of the only layer that
+    has them. Raises DataError for missing or subsampled channels.
+    """
     channels, width, height = _read_exr_header(path)
     names, expected = list(wanted or ()), ", ".join(wanted or ())
     if wanted is None:
@@ -111,7 +115,7 @@ def read_exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[li
 
 
 def _read_exr_header(path: Path) -> tuple[dict[str, Any], int, int]:
-    """Return channels by name, width and height of a file; raises DataError."""
+    """Return channels by name, width and height of an OpenEXR file; DataError if damaged, too large or unsupported."""
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
             parts = len(file.parts)
@@ -138,7 +142,7 @@ def _read_exr_header(path: Path) -> tuple[dict[str, Any], int, int]:
 
 
 def read_exr(path: Path, names: Sequence[str], width: int, height: int) -> Tensor:
-    """Return (H, W, C) float16 or float32 values of channels ``names``; raises DataError, also for NaN, infinity."""
+    """Read channels ``names`` as (H, W, C) float16 or float32; DataError for damage, another size, NaN or infinity."""
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             planes = [np.array(file.channels()[name].pixels) for name in names]

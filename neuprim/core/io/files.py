@@ -65,7 +65,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def checked_atomic_path(path: Path) -> Iterator[Path]:
-    """Like :func:`atomic_path`, in a folder that must exist; turns errors of the disk into DataError."""
+    """Yield a temporary file as :func:`atomic_path` does; raise DataError if the folder is missing or writing fails."""
     if not path.parent.is_dir():
         raise DataError(f"{path}: cannot be written (no such folder {path.parent})")
     try:
@@ -99,7 +99,11 @@ def read_json(path: Path, what: str, instead: str) -> Any:
 
 
 def read_json_record(path: Path, what: str, instead: str, version: int, parse: Callable[[Any], T]) -> T | None:
-    """Return ``parse(content)`` of a JSON file with ``"format": version``; None if missing, DataError if wrong."""
+    """Return ``parse(content)`` of a JSON file that neuprim wrote; None if the file does not exist.
+
+    Raises DataError if the field ``format`` is not ``version``, or ``parse`` fails. ``what`` and ``instead`` are as in
+    :func:`read_json`.
+    """
     data = read_json(path, what, instead)
     if data is None:
         return None
@@ -117,7 +121,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def write_npy(path: Path, values: np.ndarray) -> None:
-    """Write an array atomically, for ``numpy.load(path, allow_pickle=False)``."""
+    """Write an array atomically as an .npy file, which ``numpy.load(path, allow_pickle=False)`` reads."""
     import numpy as np
 
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
@@ -131,9 +135,10 @@ _DAY = 86400.0
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files and staging folders of killed writers from a locked folder and its subfolders.
+    """Remove temporary files and folders that killed processes left in a folder and its direct subfolders.
 
-    Files of a process that still runs on this machine stay if they are younger than a day.
+    The caller must have locked the folder. Files of a process that still runs on this machine stay if they are younger
+    than a day.
     """
     subfolders = (p for p in folder.iterdir() if p.name[0] != "." and p.is_dir() and not p.is_symlink())
     for place in (folder, *subfolders):
@@ -154,7 +159,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def _is_file_writer_running(number: str | None) -> bool:
-    """Return whether another process on this machine has the process ID ``number``."""
+    """Return whether another process on this machine has the process ID ``number``; on Windows, assume that one has."""
     # Containers reuse numbers. A file with this process's own number is old: the lock's holder has not written yet.
     if number is None or int(number) == os.getpid():
         return False
@@ -175,8 +180,8 @@ def _is_file_writer_running(number: str | None) -> bool:
 def publish_folder(final: Path, write: Callable[[Path], None], complete: Callable[[Path], bool]) -> None:
     """Let ``write`` fill a temporary folder, then rename it to ``final``; does nothing if ``complete(final)``.
 
-    An incomplete folder at ``final`` is deleted. If several processes do this, the files of the first remain, so all
-    must write the same files.
+    An incomplete folder at ``final`` is deleted. If several processes publish the same folder, the files of the first
+    one remain, so all must write the same files.
     """
     if complete(final):
         return
@@ -185,7 +190,7 @@ def publish_folder(final: Path, write: Callable[[Path], None], complete: Callabl
 
 
 def fill_folder(final: Path, write: Callable[[Path], None], complete: Callable[[Path], bool]) -> None:
-    """Like :func:`publish_folder`, but always call ``write``; the parent folder must exist."""
+    """Do as :func:`publish_folder`, but call ``write`` even if ``final`` is complete; its parent folder must exist."""
     draft = Path(tempfile.mkdtemp(prefix=f".{final.name}-", dir=final.parent))
     try:
         draft.chmod(0o755)  # mkdtemp's 0700 would hide a shared folder from its other users
@@ -220,7 +225,7 @@ class StagedOutput:
         self.out = folder / (final.name if final.name not in ("", "..") else "out")
 
     def final_path(self, path: Path) -> Path | None:
-        """Return the path that a temporary file will get; None for a file outside the temporary folder."""
+        """Return the final path of a file in the temporary folder; None for a file outside of it."""
         try:
             parts = path.resolve().relative_to(self._folder.resolve()).parts
         except ValueError:
@@ -234,7 +239,7 @@ class StagedOutput:
         return text.replace(str(self.out), str(self._final)).replace(str(self._folder), str(self._final.parent))
 
     def publish(self) -> None:
-        """Move all files to their final paths, one by one; ConfigError before the first move if a path is taken."""
+        """Move all files to final paths; unless ``overwrite``, ConfigError before the first move if a path exists."""
         moves: list[tuple[Path, Path]] = []
         for entry in sorted(self._folder.iterdir()):
             target = self.final_path(entry)
@@ -254,7 +259,10 @@ class StagedOutput:
 
 @contextmanager
 def staged_output(final: Path, overwrite: bool) -> Iterator[StagedOutput]:
-    """Yield a :class:`StagedOutput`, deleted after the block. Error messages show final, not temporary paths."""
+    """Yield a :class:`StagedOutput` whose temporary folder is deleted after the block.
+
+    The block must call :meth:`StagedOutput.publish`. Its errors name final instead of temporary paths.
+    """
     existing = final if final.is_dir() else next(p for p in (*final.parents, Path(".")) if p.exists())
     try:
         folder = Path(tempfile.mkdtemp(prefix=f".neuprim.{os.getpid()}.", dir=existing))

@@ -63,7 +63,7 @@ class ImageInfo:
 
 
 def image_info(path: Path, channels: Sequence[str] | None = None) -> ImageInfo:
-    """Return size and channels of an image from its header. Arguments and errors as of :func:`read_image`."""
+    """Return size and channels of an image from its header. Arguments and errors are as in :func:`read_image`."""
     if is_exr(path, required=channels is not None):
         names, width, height = read_exr_layout(path, channels)
         return ImageInfo(width, height, len(names), True)
@@ -94,7 +94,7 @@ def read_image(path: Path, size: tuple[int, int] | None = None, channels: Sequen
 
 
 def read_mask_image(path: Path, size: tuple[int, int] | None = None) -> Tensor:
-    """Read a mask, (H, W) bool, from PNG, JPEG or WebP: True where a colour channel is not 0. Errors as read_image."""
+    """Read a PNG, JPEG or WebP as (H, W) bool mask: True where a colour channel is not 0. Errors as in read_image."""
     with refuse_image_file_beyond_memory(path), _open_image(path) as image:
         _lossless_mode(path, image)
         _check_image_size(path, image.width, image.height, size)
@@ -132,14 +132,14 @@ def _open_image(path: Path) -> Iterator[Image.Image]:
 
 
 def _png_depth_and_kind(path: Path) -> tuple[int, int]:
-    """Return (bit depth, colour type) of a PNG; (0, -1) for other files. Needed as Pillow opens 16-bit RGB as 8-bit."""
+    """Return (bit depth, colour type) of a PNG, else (0, -1). Pillow does not tell: it opens 16-bit RGB as 8-bit."""
     with open(path, "rb") as file:
         head = file.read(26)
     return (head[24], head[25]) if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 26 else (0, -1)
 
 
 def _lossless_mode(path: Path, image: Image.Image) -> str:
-    """Return "RGB" or "RGBA", which represents the image without loss; DataError if none does, or for an animation."""
+    """Return "RGB" or "RGBA", the mode that holds the image without loss; DataError if none does, or for animations."""
     depth, kind = _png_depth_and_kind(path)
     if depth == 16 or image.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
         what = {"L": "8-bit grey JPEG", "CMYK": "CMYK JPEG"}.get(image.mode, f"{image.format} of mode {image.mode}")
@@ -186,7 +186,7 @@ def to_uint8(image: Tensor) -> Tensor:
 
 
 def pillow_image(path: Path, image: Tensor) -> Image.Image:
-    """Convert (H, W, 3 or 4) sRGB values to an 8-bit image; DataError, with ``path``, for a wrong shape or NaN."""
+    """Convert (H, W, 3 or 4) sRGB values to an 8-bit Pillow image; raise DataError, naming ``path``, for bad values."""
     if image.ndim != 3 or image.shape[-1] not in (3, 4) or 0 in image.shape:
         raise DataError(f"{path}: image to write has shape {tuple(image.shape)}; expected (H, W, 3) or (H, W, 4)")
     try:
@@ -203,7 +203,7 @@ def write_png(path: Path, image: Tensor) -> None:
 
 
 def write_webp(path: Path, image: Tensor) -> None:
-    """Write (H, W, 3 or 4) sRGB values as a still WebP; arguments as of :func:`write_png`."""
+    """Write (H, W, 3 or 4) sRGB values as a still WebP; arguments are as in :func:`write_png`."""
     picture = pillow_image(path, image)
     with checked_atomic_path(path) as temporary:
         picture.save(temporary, format="WEBP", quality=90)

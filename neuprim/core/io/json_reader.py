@@ -221,7 +221,10 @@ ArrayType = tuple[Any, tuple[int | None, ...]]  # dtype and shape; None for any 
 
 
 def read_npz_arrays(path: Path, wanted: Mapping[str, ArrayType]) -> dict[str, np.ndarray]:
-    """Read the ``wanted`` arrays of a ``numpy.savez`` file; DataError before memory is allocated for a wrong array."""
+    """Read arrays of an uncompressed ``numpy.savez`` file; ``wanted`` maps names to (dtype, shape).
+
+    Raises DataError for a damaged file, or a missing or different array, before memory is allocated for that array.
+    """
     damaged = (OSError, ValueError, KeyError, EOFError, RuntimeError, SyntaxError, TokenError, zipfile.BadZipFile)
     try:
         size = path.stat().st_size

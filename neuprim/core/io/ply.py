@@ -46,7 +46,7 @@ class PlyVertices:
 
 @dataclass(frozen=True)
 class PlyList:
-    """A list property of all rows of an element: row i has the next ``sizes[i]`` numbers of ``values``."""
+    """A list property: ``values`` joins the lists of all rows of an element; row i has ``sizes[i]`` numbers."""
 
     sizes: np.ndarray
     values: np.ndarray
@@ -89,7 +89,10 @@ def read_ply(path: Path) -> PlyVertices:
 
 
 def read_ply_elements(file: BinaryIO, size: int, path: Path, wanted: Sequence[str]) -> dict[str, PlyElement]:
-    """Read the ``wanted`` elements of an open PLY file of ``size`` bytes, as far as it has them; raise DataError."""
+    """Read the elements named in ``wanted`` from an open PLY file; elements that the file lacks are left out.
+
+    ``size`` is the size of the file in bytes. Raises DataError, which names ``path``, for a damaged file.
+    """
     order, elements, comments = _read_ply_header(file, path)
     result: dict[str, PlyElement] = {}
     missing = set(wanted) & {element.name for element in elements}
@@ -177,7 +180,11 @@ def _describe_ply_rows(element: _ElementHeader) -> str:
 
 
 def _read_binary(file: BinaryIO, path: Path, element: _ElementHeader, order: str, left: int) -> _Values:
-    """Read the rows of a binary element: all at once if they have equal sizes, one by one if lists differ in length."""
+    """Read the rows of an element of a binary file; return scalar properties, (N,) structured, and lists by name.
+
+    Rows are read all at once if they have equal sizes, one by one if lists differ in length. ``order`` is the byte
+    order ("<" or ">"), ``left`` the number of bytes to the end of the file.
+    """
     count, fields = element.count, element.fields
     if not count or not fields:
         return np.zeros(0, [(name, order + kind) for name, kind, length in fields if not length]), {}
@@ -209,7 +216,7 @@ def _read_binary(file: BinaryIO, path: Path, element: _ElementHeader, order: str
 
 
 def _first_ply_list_lengths(file: BinaryIO, fields: list[tuple[str, str, str]], order: str) -> list[int] | None:
-    """Return the length of each property of the first row, 1 for scalars; None if a length is impossible."""
+    """Read the first row; return the number of values of each property, 1 for scalars; None if one is impossible."""
     sizes = []
     for _, kind, length in fields:
         size = 1

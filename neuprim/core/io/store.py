@@ -1,7 +1,7 @@
 """Storage that several processes and machines share: a local or mounted folder, or an object store with a URL.
 
-A subfolder counts as complete when its last file exists, so that an interrupted write never looks complete. Two
-processes may write the same subfolder: both write the same files, and either may finish first.
+A subfolder counts as complete when it has the file that is written last, so that an interrupted write never looks
+complete. Two processes may write the same subfolder: both write the same files, and either may finish first.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def open_store(address: str, copies: Path) -> Store:
 
 
 class Store:
-    """A shared folder: ``path``, or ``root`` in fsspec's file system ``system``. A written file never changes."""
+    """A shared folder ``path``, or ``root`` in an fsspec ``system``, copied to ``path``. Files are never changed."""
 
     def __init__(self, address: str, path: Path, system: Any = None, root: str = "") -> None:
         self.address, self.path, self._system, self._root = address, path, system, root
@@ -92,7 +92,7 @@ class Store:
                 self._system.makedirs(self._root, exist_ok=True)
 
     def complete_folders(self, last: str) -> set[str]:
-        """Return the names of the subfolders that contain the file ``last``."""
+        """Return the names of the complete subfolders: those that contain the file ``last``, which is written last."""
         if not self.is_local:
             with self._client_errors("read"):
                 self._system.invalidate_cache()
@@ -136,7 +136,11 @@ class Store:
         return file
 
     def write_folder(self, name: str, write: Callable[[Path], None], last: str) -> None:
-        """Let ``write`` fill a folder, and store it as ``name`` unless a folder with the file ``last`` exists."""
+        """Let ``write`` fill a temporary folder, and store it as the subfolder ``name``.
+
+        A subfolder on disk that already contains ``last`` is kept. An object store gets the file ``last`` after all
+        other files.
+        """
         if self.is_local:  # the store's folder must exist: creating a lost mount would hide it
             fill_folder(self.path / name, write, lambda folder: (folder / last).is_file())
             for draft in self.path.glob(f".{name}-*"):  # of killed or slower processes
@@ -163,7 +167,8 @@ class Store:
     def retry(self, call: Callable[[], T], notify: Callable[[str], None]) -> T:
         """Return what ``call`` returns. If a local store disappears during the call, wait for the store and call again.
 
-        Raises DataError if the store is unavailable for :data:`MAX_WAIT` seconds. Other errors are raised again.
+        ``notify`` is called with a line of text before waiting. Raises DataError if the store is unavailable for
+        :data:`MAX_WAIT` seconds. Other errors are raised again.
         """
         second_try = True
         while True:
@@ -187,7 +192,7 @@ class Store:
             return True
 
     def _may_be_transient(self, error: Exception) -> bool:
-        """Return whether the error may come from a short loss of the folder: a file in the folder was not found."""
+        """Return whether ``error`` may come from a short loss of the store's folder, such as "file not found"."""
         cause = error if isinstance(error, OSError) else error.__cause__
         number = cause.errno if isinstance(cause, OSError) else None
         return number in (None, *_DISAPPEARED) and str(self.path) in str(error)
@@ -205,7 +210,7 @@ class Store:
 
     @contextmanager
     def _client_errors(self, action: str) -> Iterator[None]:
-        """Turn errors of the object store's client in the block into DataError."""
+        """Turn errors of the object store's client in the block into DataError "cannot be ``action``"."""
         try:
             yield
         except NeuprimError:

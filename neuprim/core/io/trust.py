@@ -20,7 +20,7 @@ def trusted() -> bool:
 
 @contextmanager
 def trusting(said: bool) -> Iterator[None]:
-    """Trust other people's runs in the block if ``said`` (``--trust`` was given) or the environment variable is set."""
+    """Make :func:`trusted` return True in the block if ``said`` (``--trust``); else NEUPRIM_TRUST decides."""
     before = os.environ.get(ENVIRONMENT)
     if said:
         os.environ[ENVIRONMENT] = "1"

@@ -1,4 +1,4 @@
-"""Metrics of images against ground truth."""
+"""Metrics that compare rendered images with ground truth."""
 
 from neuprim.core.metrics.image import (
     comparable_images,

@@ -1,7 +1,7 @@
 """Image quality of one rendered view against its ground truth: PSNR and SSIM.
 
 Float images (H, W, C) are compared as they are: nothing is clipped, quantised or converted. Sums are in float64. JSON
-has no infinity: files hold ``{"psnr": null, "psnr_infinite": true}`` (:func:`metric_to_json`).
+has no infinity, so files state an infinite PSNR as ``{"psnr": null, "psnr_infinite": true}`` (:func:`metric_to_json`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _MAX_NAMED = 6  # views in one line; metrics.json names all
 def comparable_images(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
     """Return both images as detached float64 (H, W, C) on the CPU.
 
-    Raises DataError for images that cannot be compared, and NonFiniteError for NaN or infinity.
+    Raises DataError for different shapes or values that are not floats, and NonFiniteError for NaN or infinity.
     """
     first, second = _check_images(rendered, truth)
     return first.double(), second.double()
@@ -80,7 +80,7 @@ def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: floa
 
 
 def psnr_gain(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: float = 1.0) -> float:
-    """Return the :func:`psnr` of ``rendered`` after each channel is scaled by the factor that fits ``truth`` best."""
+    """Return the :func:`psnr` after each channel of ``rendered`` is scaled by the factor that fits ``truth`` best."""
     first, second = comparable_images(rendered, truth)
     counted = torch.ones(second.shape[:2], dtype=torch.bool) if mask is None else mask.cpu()
     square = first[counted].square().sum(0)
@@ -126,7 +126,7 @@ def metric_to_json(key: str, value: float) -> dict[str, float | bool | None]:
 
 
 def mean_metrics(views: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """Return JSON-able means of metrics over views, by the rules of ``TaskSpec.metrics``."""
+    """Return JSON-able means of metrics over ``views`` (metric name -> value) by the rules of ``TaskSpec.metrics``."""
     result: dict[str, Any] = {}
     for name in sorted({key for v in views for key in v}):
         having = [v for v in views if name in v]
@@ -152,7 +152,8 @@ def metric_from_json(entries: Mapping[str, object], key: str) -> float | None:
 
 
 def format_metrics(metrics: Mapping[str, Any]) -> str:
-    """Summarise metrics.json: ``PSNR 29.99 dB, SSIM 0.977 (20 held-out views)``; the PSNR omits infinite values."""
+    """Return a line on the content of metrics.json, ``PSNR 29.99 dB, SSIM 0.977 (20 held-out views)``; the mean PSNR is
+    that of the finite values."""
     values = [value for entry in metrics["per_view"] if (value := metric_from_json(entry, "psnr")) is not None]
     wrong = [value for value in values if math.isfinite(value)]
     exact = f", {len(values) - len(wrong)} exact" if len(wrong) < len(values) else ""
@@ -162,7 +163,7 @@ def format_metrics(metrics: Mapping[str, Any]) -> str:
 
 
 def format_failed_views(metrics: Mapping[str, Any]) -> str:
-    """Name the held-out views of metrics.json that are worse than a black image; "" if there are none."""
+    """Return a line that names the held-out views in metrics.json that are worse than a black image; "" for none."""
     bad = metrics["worse_than_black_image"]
     if not bad:
         return ""

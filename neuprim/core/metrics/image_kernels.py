@@ -1,4 +1,4 @@
-"""SSIM and squared error of two images, in float64, on all cores, without copies of the images."""
+"""Compiled CPU kernels for the SSIM and squared error of two images: float64, all cores, no copies of images."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ _PIXELS = 1 << 15  # pixels whose errors are summed at a time
 
 @inline
 def _blur_moments_down(moments, x, y, at, pitch, count):  # type: ignore[no-untyped-def]
-    """Blur x, y, x^2, y^2 and xy of flat images x and y over 11 rows from position ``at``; fill ``moments``."""
+    """Fill ``moments`` (5, at least ``count``) with the blurred x, y, x^2, y^2 and xy of two flattened images x and y.
+
+    Only the vertical half of the Gaussian blur is done, over 11 rows from the index ``at``, ``pitch`` values per row.
+    """
     for j in range(count):
         s0, s1, s2, s3, s4 = 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(SSIM_WINDOW):
@@ -61,7 +64,8 @@ def _sum_ssim_of_moments(s, count, c1, c2):  # type: ignore[no-untyped-def]
 
 @kernel
 def _sum_ssim_of_rows(start, stop, x, y, height, channels, c1, c2):  # type: ignore[no-untyped-def]
-    """Return the sum of SSIM over window rows start:stop of x and y, flat images of (height, width, channels)."""
+    """Return the sum of SSIM over the 11 x 11 windows whose top row is in start:stop; x and y are flattened images
+    (height, width, channels)."""
     pitch = x.shape[0] // height
     reach = (SSIM_WINDOW - 1) * channels
     windows = pitch - reach
@@ -96,7 +100,8 @@ def mean_ssim(first: Tensor, second: Tensor, peak: float) -> float:
 
 @exact_kernel
 def _sum_squares_of_pixels(start, stop, x, y, counted, channels):  # type: ignore[no-untyped-def]
-    """Return the sum of squared differences over pixels start:stop that ``counted`` marks, all if it is empty."""
+    """Return the sum of squared differences of flattened images x and y over pixels start:stop where ``counted`` is
+    True; an empty ``counted`` selects all."""
     total = 0.0
     for pixel in range(start, stop):
         if counted.size == 0 or counted[pixel]:
@@ -107,7 +112,8 @@ def _sum_squares_of_pixels(start, stop, x, y, counted, channels):  # type: ignor
 
 
 def sum_squared_errors(first: Tensor, second: Tensor, mask: Tensor | None) -> float:
-    """Sum the squared differences of (H, W, C) images, float32 or float64, where an (H, W) bool mask is True."""
+    """Return the sum of squared differences of (H, W, C) images, float32 or float64, where the (H, W) bool mask is
+    True; None selects all pixels."""
     channels, count = first.shape[-1], first.shape[0] * first.shape[1]
     counted = np.empty(0, np.bool_) if mask is None else _flat_values(mask)
     images = _flat_values(first), _flat_values(second)

@@ -1,8 +1,8 @@
-"""LPIPS, the learned perceptual distance of two images (Zhang et al. 2018), with the user's own weights.
+"""LPIPS, the learned perceptual distance of two images (Zhang et al. 2018), and the metric FLIP.
 
-Weights are state dictionaries that LPIPS and torchvision publish, as torch or safetensors files: either a whole
-``lpips.LPIPS(net="vgg")``, or a folder with one file of linear layers and one of convolutions. The shapes of the
-tensors tell whether the network is AlexNet or VGG16.
+Users provide the weights of LPIPS: state dictionaries that LPIPS and torchvision publish, as torch or safetensors
+files. They are either a whole ``lpips.LPIPS(net="vgg")``, or a folder with one file of linear layers and one of
+convolutions. The shapes of the tensors tell whether the network is AlexNet or VGG16.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ __all__ = ["Lpips", "flip", "flip_available"]
 
 
 class _Layer(NamedTuple):
-    """A convolution followed by a ReLU."""
+    """A convolution of AlexNet or VGG16, followed by a ReLU."""
 
     number: int  # index in torchvision's features
     inputs: int
@@ -77,7 +77,7 @@ class Lpips:
 
     @property
     def least(self) -> int:
-        """Smallest side of an image, pixels."""
+        """Smallest height and width of images that LPIPS accepts, in pixels."""
         return _LEAST[self.network]
 
     @staticmethod
@@ -112,7 +112,8 @@ class Lpips:
             return sum(float(((a - b).square() * w[None, :, None, None]).sum(1).double().mean()) for a, b, w in pairs)
 
     def _features(self, image: Tensor) -> Iterable[Tensor]:
-        """Yield the output of every compared layer, each pixel's channels normalised to length 1."""
+        """Yield the output (1, C, h, w) of every layer that LPIPS compares; the channels of each pixel are normalised
+        to length 1."""
         x = (image - torch.tensor(_SHIFT)[None, :, None, None]) / torch.tensor(_SCALE)[None, :, None, None]
         for layer, weight, bias in zip(_NETWORKS[self.network], self.weights, self.biases, strict=True):
             if layer.pool:

@@ -1,7 +1,7 @@
-"""Check the tensors that fields return. Error messages name field, tensor, found and expected value in one line.
+"""Checks of the tensors that fields return; one-line errors name field, tensor, found and expected value.
 
-Compiled kernels do not check bounds, and torch would broadcast wrong shapes. Tensors are float32 or float64, in any
-mix, dense and all on one device; strides do not matter.
+They are needed because compiled kernels do not check bounds, and torch would broadcast wrong shapes. Valid tensors are
+float32 or float64, in any mix, dense and all on one device; strides do not matter.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def _is_dense_primitive_tensor(value: Any) -> bool:
 
 
 def _describe_model_tensor(value: Any) -> str:
-    """Describe a value for messages: its type, or dtype, layout, shape and device."""
+    """Describe a value for messages: dtype, layout, shape and device of a tensor, the type of anything else."""
     if not isinstance(value, Tensor):
         return f"type {type(value).__name__}"
     layout = "" if value.layout is torch.strided else f" {value.layout}"
@@ -51,21 +51,21 @@ def _describe_model_tensor(value: Any) -> str:
 
 
 def model_field_label(kind: str, field: str | None) -> str:
-    """Return ``"density field Waves"``, or ``"density"`` if the field is unknown."""
+    """Return a field's label for messages, ``"density field Waves"``, or ``"density"`` if ``field`` is None."""
     return kind if field is None else f"{kind} field {field}"
 
 
 def model_method_label(field: Field, name: str) -> str:
-    """Return ``"density field Waves: on_split"``, the name of a field's method for messages."""
+    """Return the label of a field's method for messages, such as ``"density field Waves: on_split"``."""
     return (
         f"{model_field_label('density' if isinstance(field, DensityField) else 'colour', type(field).__name__)}: {name}"
     )
 
 
 def check_geometry(geometry: Any, who: str, count: int | None = None) -> Sizes:
-    """Return the sizes that the tensors of a :class:`Geometry` share, or raise FormError if they do not fit.
+    """Return the sizes (such as N) that the ellipsoids' tensors share; raise FormError if these tensors do not fit.
 
-    ``count`` is the expected number of primitives, if known.
+    ``count`` is the expected number of ellipsoids, if known. ``who`` names the source of ``geometry`` in messages.
     """
     if not isinstance(geometry, Geometry):
         raise FormError(f"{who} has type {type(geometry).__name__}; expected Geometry")
@@ -77,12 +77,14 @@ def check_geometry(geometry: Any, who: str, count: int | None = None) -> Sizes:
 
 
 def check_lowered_density(density: Any, sizes: Sizes, field: str | None) -> None:
-    """Raise :class:`FormError` unless a lowered density fits the ``sizes`` from :func:`check_geometry`."""
+    """Raise :class:`FormError` unless the density in closed form fits the ``sizes`` from :func:`check_geometry`.
+    ``field`` is the class name of the density field, for messages."""
     _check_lowered_form(model_field_label("density", field), density, _DENSITIES, sizes)
 
 
 def check_lowered_colour(colour: Any, sizes: Sizes, field: str | None) -> None:
-    """Raise :class:`FormError` unless a lowered colour fits the ``sizes`` from :func:`check_geometry`."""
+    """Raise :class:`FormError` unless the colour in closed form fits the ``sizes`` from :func:`check_geometry`.
+    ``field`` is the class name of the colour field, for messages."""
     _check_lowered_form(model_field_label("colour", field), colour, _COLOURS, sizes)
 
 
@@ -96,7 +98,8 @@ def _check_lowered_form(who: str, form: Any, kinds: tuple[type[PrimitiveTensors]
 
 
 def check_lowered_channels(found: int, colour: ColourField) -> None:
-    """Raise :class:`FormError` unless ``found``, the channels of a lowered colour, equals ``colour.channels``."""
+    """Raise :class:`FormError` unless a colour field returned as many channels as it declares. ``found`` is the number
+    in the closed form; ``colour.channels`` is declared."""
     if found != colour.channels:
         raise FormError(
             f"{model_method_label(colour, 'lower')} returned a colour of C={found}; "
@@ -114,7 +117,8 @@ def check_model_tensor_shape(name: str, value: Any, shape: tuple[int, ...], why:
 
 
 def check_active_primitive_rows(rows: Any, model: int | None, who: str, length: int | None = None) -> None:
-    """Raise :class:`FormError` unless ``rows`` are ascending int64 numbers below ``model``, ``length`` in number."""
+    """Raise :class:`FormError` unless ``rows`` are ascending int64 indices of primitives, (M,). ``model`` is the number
+    of primitives, which all indices must be below. ``length`` is the expected M. None: no check."""
     found = None
     if not _is_dense_primitive_tensor(rows) or rows.dtype != torch.int64 or rows.dim() != 1:
         found = _describe_model_tensor(rows)
@@ -133,7 +137,7 @@ def check_active_primitive_rows(rows: Any, model: int | None, who: str, length: 
 
 
 def check_primitive_field_result(value: Any, shape: tuple[int, ...], who: str) -> Tensor:
-    """Return the result of a field's method; raise FormError unless the result is a dense real tensor of this shape."""
+    """Return ``value``, a field method's result; raise FormError unless it is a dense real tensor of ``shape``."""
     if not _is_dense_primitive_tensor(value) or not value.is_floating_point():
         kinds = " or ".join(device.DEVICE_TYPES)
         raise FormError(
@@ -160,7 +164,8 @@ def check_primitive_shading(found: Any, count: int, who: str) -> Shading:
 
 
 def check_initial_primitive_tensor(spec: ParameterSpec, context: InitContext, who: str) -> Tensor:
-    """Return the float32 start value (N, *shape) that a parameter's own initialiser draws."""
+    """Return the float32 start value (N, *shape) of a parameter, drawn by the function ``spec.init``. Raises FormError
+    if the function returns another type or shape."""
     value, shape = spec.init(context), (context.count, *spec.shape)
     if not isinstance(value, Tensor):
         raise FormError(f"{who}: {spec.name}: init returned type {type(value).__name__}; expected a torch tensor")
@@ -187,7 +192,8 @@ def check_primitive_tensors(found: Any, like: Mapping[str, Tensor], who: str) ->
 
 
 def non_finite_primitive_error(tensors: Mapping[str, Tensor], row: int) -> NonFiniteError:
-    """Return the error for primitive ``row``, which has a value that is not finite or beyond the range of float32."""
+    """Return an error that says why primitive ``row`` cannot be rendered. The reason is a NaN or infinite value, a zero
+    quaternion, or semi-axes beyond the range of float32."""
     for name, value in tensors.items():
         if not bool(torch.isfinite(value[row]).all()):
             return NonFiniteError(f"{name} of primitive {row} is not finite: {value[row].flatten()[:8].tolist()}")
@@ -200,10 +206,8 @@ def non_finite_primitive_error(tensors: Mapping[str, Tensor], row: int) -> NonFi
 
 
 def check_primitive_colours_finite(tensors: Mapping[str, Tensor], named: Mapping[str, Tensor] | None = None) -> None:
-    """Raise NonFiniteError for non-finite colours, because the kernels that check primitives do not read colours.
-
-    Synchronises with a GPU. ``named`` are all tensors of the frame; the message names the first that is not finite.
-    """
+    """Raise NonFiniteError if a colour is NaN or infinite; kernels that check primitives do not read colours. Waits for
+    a GPU. ``named`` are all tensors of the frame; the message names the first that is not finite."""
     total = sum(tensor.detach().sum(dtype=torch.float64) for tensor in tensors.values())
     if math.isfinite(total):  # one number, so that a GPU is waited for once
         return

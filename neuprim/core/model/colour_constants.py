@@ -1,5 +1,8 @@
-"""Constants of colours, for all kernels: factors of the real spherical harmonics up to degree 3, with the signs of 3D
-Gaussian splatting, and limits of lobes."""
+"""Constants of the kernels that compute view-dependent colours.
+
+C0 to C3 are factors of the real spherical harmonics of degrees 0 to 3, with the signs of 3D Gaussian splatting. The
+others are limits of spherical Gaussian lobes.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +31,8 @@ C3 = (
 MOST_LOBES = 8
 
 LOG_LIMIT = 20.0
-"""Logarithms of a lobe's sharpness are clamped to plus or minus this value, without gradient beyond."""
+"""The logarithm of a lobe's sharpness is clamped to plus or minus this value. Beyond, its gradient is zero."""
 
 SHORTEST = 1e-24
-"""Vectors of at most this length have no direction: the unit vector is zero and passes no gradient. The limit keeps
+"""Vectors of at most this length are treated as zero: they have no direction and pass no gradient. The limit keeps
 gradients of float32 numbers finite."""

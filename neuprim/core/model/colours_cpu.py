@@ -1,5 +1,7 @@
-"""Compiled CPU kernels of view-dependent colours, forward and backward, float64 inside:
-harmonics (:mod:`neuprim.core.model.sh`) and lobes (:mod:`neuprim.core.model.lobes`)."""
+"""Compiled CPU kernels of view-dependent colours, forward and backward, with float64 arithmetic.
+
+Colours are spherical harmonics (:mod:`neuprim.core.model.sh`) or lobes (:mod:`neuprim.core.model.lobes`).
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,7 @@ _CHUNK = 8192  # primitives per unit of work: a quarter of a millisecond, long c
 
 @strict
 def _basis(x, y, z, degree, Y):  # type: ignore[no-untyped-def]
-    """Write bands 1..degree of :func:`~neuprim.core.model.sh.sh_basis` at a unit direction into Y[0:15]."""
+    """Write the spherical harmonics of bands 1 to ``degree`` at the unit vector (x, y, z) into ``Y`` (15,)."""
     Y[0], Y[1], Y[2] = -C1 * y, C1 * z, -C1 * x
     if degree >= 2:
         xx, yy, zz = x * x, y * y, z * z
@@ -41,7 +43,8 @@ def _basis(x, y, z, degree, Y):  # type: ignore[no-untyped-def]
 
 @strict
 def _basis_gradient(x, y, z, degree, g, out):  # type: ignore[no-untyped-def]
-    """Write sum_k g[k] dY_k/d(x, y, z) into ``out``, with the basis as polynomials of a direction of any length."""
+    """Write sum_k g[k] dY_k/d(x, y, z) into ``out`` (3,), with Y the spherical harmonics that :func:`_basis` writes. Y
+    is differentiated as polynomials in x, y and z, without the constraint that (x, y, z) has length 1."""
     gx, gy, gz = -C1 * g[2], -C1 * g[0], C1 * g[1]
     if degree >= 2:
         a, b, c, d, e = C2[0] * g[3], C2[1] * g[4], C2[2] * g[5], C2[3] * g[6], C2[4] * g[7]
@@ -149,7 +152,8 @@ class _HarmonicColors(torch.autograd.Function):
 
 
 def fused_harmonic_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
-    """Compute :func:`~neuprim.core.model.sh.sh_colors` for float32 CPU tensors, degree 1..3; differentiable."""
+    """Return the (N, C) colours of :func:`~neuprim.core.model.sh.sh_colors`, computed by CPU kernels; differentiable.
+    ``means``, ``dc`` and ``rest`` are float32 on the CPU; ``degree`` is 1 to 3."""
     result: Tensor = apply_kernel_operation(_HarmonicColors, means, dc, rest, origin, degree)
     return result
 
@@ -159,7 +163,7 @@ def fused_harmonic_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tenso
 
 @strict
 def _unit_or_zero(x, y, z):  # type: ignore[no-untyped-def]
-    """Return the normalised vector and 1/length; zeros for a vector too short to have a direction."""
+    """Return the unit vector of (x, y, z) and 1/length, four numbers; all are 0 for a length of at most 1e-24."""
     length = np.sqrt(x * x + y * y + z * z)
     over = 1.0 / length if length > SHORTEST else 0.0
     return x * over, y * over, z * over, over
@@ -167,7 +171,11 @@ def _unit_or_zero(x, y, z):  # type: ignore[no-untyped-def]
 
 @strict
 def lobe_weight(nearness, log_sharpness):  # type: ignore[no-untyped-def]
-    """Return a lobe's weight, ``nearness`` clamped to at most 0, and the sharpness; NaN stays NaN."""
+    """Return the weight exp(s ``nearness``) of a spherical Gaussian lobe, ``nearness`` clamped to at most 0, and s.
+
+    ``nearness`` is the cosine between lobe axis and view direction, minus 1. The sharpness s is exp(``log_sharpness``),
+    with the logarithm clamped to -20..20. NaN stays NaN.
+    """
     if log_sharpness > LOG_LIMIT:
         log_sharpness = LOG_LIMIT
     if log_sharpness < -LOG_LIMIT:
@@ -255,6 +263,7 @@ class _LobeColors(torch.autograd.Function):
 def fused_lobe_colors(
     means: Tensor, dc: Tensor, amplitude: Tensor, axis: Tensor, log_sharpness: Tensor, origin: Tensor
 ) -> Tensor:
-    """Compute :func:`~neuprim.core.model.lobes.lobe_colors` for float32 CPU tensors with lobes; differentiable."""
+    """Return the (N, C) colours of :func:`~neuprim.core.model.lobes.lobe_colors`, computed by CPU kernels;
+    differentiable. All tensors but ``origin`` are float32 on the CPU. There is at least one lobe."""
     result: Tensor = apply_kernel_operation(_LobeColors, means, dc, amplitude, axis, log_sharpness, origin)
     return result

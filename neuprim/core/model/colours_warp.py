@@ -1,7 +1,7 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""GPU kernels of view-dependent colours (harmonics and lobes), one thread per primitive, float64 inside.
+"""GPU kernels of view-dependent colours: spherical harmonics and spherical Gaussian lobes.
 
-The CPU kernels are in :mod:`neuprim.core.model.colours_cpu`.
+One thread computes one primitive, in float64. The CPU kernels are in :mod:`neuprim.core.model.colours_cpu`.
 """
 
 import functools
@@ -27,7 +27,7 @@ def _harmonic_functions(degree: int) -> tuple[Any, Any]:
 
     @wp.func
     def basis(v: wp.vec3d):
-        """Return bands 1 to ``degree`` of the harmonics at a unit direction."""
+        """Return the spherical harmonics of bands 1 to ``degree`` at the unit vector v."""
         x, y, z = v[0], v[1], v[2]
         Y = _vec15()
         Y[0] = -_C1 * y
@@ -52,7 +52,7 @@ def _harmonic_functions(degree: int) -> tuple[Any, Any]:
 
     @wp.func
     def gradient(v: wp.vec3d, g: _vec15):
-        """Return sum_k g_k dY_k/d(x, y, z), with the basis as polynomials of a direction of any length."""
+        """Return sum_k g_k dY_k/dv (3 numbers), Y = basis(v), without the constraint that v has length 1."""
         x, y, z = v[0], v[1], v[2]
         out = wp.vec3d(-_C1 * g[2], -_C1 * g[0], _C1 * g[1])
         if wp.static(degree >= 2):
@@ -166,7 +166,8 @@ class _HarmonicColors(torch.autograd.Function):
 
 
 def fused_harmonic_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
-    """Compute :func:`~neuprim.core.model.sh.sh_colors` for float32 GPU tensors, degree 1..3; differentiable."""
+    """Return the (N, C) colours of :func:`~neuprim.core.model.sh.sh_colors`, computed by one GPU kernel;
+    differentiable. ``means``, ``dc`` and ``rest`` are float32 on the GPU; ``degree`` is 1 to 3."""
     result: Tensor = _HarmonicColors.apply(means, dc, rest, origin, degree)
     return result
 
@@ -179,7 +180,7 @@ _LIMIT, _SHORTEST = wp.constant(d(LOG_LIMIT)), wp.constant(d(SHORTEST))
 
 @wp.func
 def _one_over(v: wp.vec3d):
-    """Return the reciprocal of a vector's length; zero for vectors too short to have a direction."""
+    """Return 1/length of a vector; 0 for a length of at most 1e-24, too short for a direction."""
     length = wp.length(v)
     if length > _SHORTEST:
         return d(1.0) / length
@@ -313,6 +314,7 @@ class _LobeColors(torch.autograd.Function):
 def fused_lobe_colors(
     means: Tensor, dc: Tensor, amplitude: Tensor, axis: Tensor, log_sharpness: Tensor, origin: Tensor
 ) -> Tensor:
-    """Compute :func:`~neuprim.core.model.lobes.lobe_colors` for float32 GPU tensors with lobes; differentiable."""
+    """Return the (N, C) colours of :func:`~neuprim.core.model.lobes.lobe_colors`, computed by one GPU kernel;
+    differentiable. All tensors but ``origin`` are float32 on the GPU. There is at least one lobe."""
     result: Tensor = _LobeColors.apply(means, dc, amplitude, axis, log_sharpness, origin)
     return result

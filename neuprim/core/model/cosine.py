@@ -3,7 +3,8 @@
     sigma(x) = g (1 - |y|^2)^p f(x~)/m inside the ellipsoid |y| < 1,   f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k))
     + b2,   g = exp(log_gain)
 
-p = 0 without gain is the paper's primitive; p = 2 with K = 0 is close to a Gaussian, with a support that ends.
+x~ = (x - mu)/m, with the centre mu and the longest semi-axis m; y is x in coordinates in which the ellipsoid is the
+unit ball. p = 0 without gain is the paper's primitive. p = 2 with K = 0 is close to a Gaussian that ends there.
 
 **Canonical form.** A sum of w_k cos(rate (v_k . x + b_k)) stays the same when (v_k, b_k) changes sign, when rate b_k
 gains a whole turn, and when rate b_k gains half a turn and w_k changes sign. So every w_k can be positive, and every
@@ -16,7 +17,7 @@ ellipsoid with semi-axes s and orientation R, x~ = R diag(s/m) y with y in the u
     r = omega0 diag(s/m) R^T W1
 
 and its variance follows from the mean of cos^2 = (1 + cos 2(.))/2. Where phases advance in time, phi + xi a for xi in
-0..1, b gets the factor sinc(a/2) and phi becomes phi + a/2. Means are those of a hard edge.
+0..1, b gets the factor sinc(a/2) and phi becomes phi + a/2. All means assume a hard edge.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ __all__ = ["CosineDensity", "cosine_density", "split_cosine"]
 OMEGA0 = 30.0  # SIREN boost: multiplies the whole phase
 
 GAIN_LIMIT = 20.0
-"""Bound to which log_gain is clamped, without gradient beyond. No scene needs densities so far apart, and products with
-the other weights stay far from the limits of float32."""
+"""log_gain is clamped to plus or minus this value, without gradient beyond. No scene needs densities so far apart, and
+products with the other weights stay far from the limits of float32."""
 
 
 DENSITY_OPTIONS: dict[str, Any] = {"edge": EDGES, "gain": bool, "omega0": Annotated[float, Range(above=0)]}
@@ -59,12 +60,12 @@ class CosineDensity(DensityField):
 
     The field lowers to :class:`~neuprim.core.model.fields.Cosine`. Each primitive has 5K + 1 parameters, plus one with
     ``gain``. ``init.mode`` "opaque" (default) starts every primitive at central opacity ``init.alpha``. "paper" draws
-    the offset as the authors do; half of all chords then have no gradient. Raises ValueError for invalid arguments.
+    the offset as the paper does; half of all chords then have no gradient. Raises ValueError for invalid arguments.
 
     Args:
-        neurons: K, 0 to 16.
+        neurons: number K of cosines, 0 to 16.
         omega0: factor on the phases, above 0.
-        edge: p: 0 for a hard edge, 1 or 2 for a soft one.
+        edge: exponent p of the factor (1 - |y|^2)^p: 0 for a hard edge, 1 or 2 for a soft one.
         gain: whether a parameter log_gain multiplies the density by its exponential.
     """
 
@@ -137,7 +138,7 @@ class CosineDensity(DensityField):
         )
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Return the neurons."""
+        """Return one unit per neuron: its frequencies, phase and amplitude."""
         return tuple(PrunableUnit(f"neuron {k}", {"W1": (k,), "b1": (k,), "w2": (k,)}) for k in range(self.neurons))
 
     def script(self) -> str:
@@ -152,7 +153,10 @@ class CosineDensity(DensityField):
 
 
 def apply_density_gain(w2: Tensor, b2: Tensor, log_gain: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return ``w2`` (N, K) and ``b2`` (N, 1), each times exp(``log_gain``), where ``log_gain`` is (N, 1) or (N,)."""
+    """Return amplitudes ``w2`` (N, K) and offsets ``b2`` (N, 1) multiplied by exp(``log_gain``), (N, 1) or (N,).
+
+    ``log_gain`` is clamped to plus or minus :data:`GAIN_LIMIT`. With None, both are returned unchanged.
+    """
     if log_gain is None:
         return w2, b2
     from neuprim.core.model.rows import fused_cosine_gain  # numba, loaded when first needed
@@ -161,7 +165,7 @@ def apply_density_gain(w2: Tensor, b2: Tensor, log_gain: Tensor | None) -> tuple
 
 
 _FAINT, _SOLID = 0.02, 0.98
-"""Range to which the opacities of starting points are clamped: beyond, little light or little gradient passes."""
+"""Range to which the opacities of starting points are clamped: beyond, a primitive passes little light or gradient."""
 
 
 def _initial_density_offset(ctx: InitContext, amplitude: float, norm: float) -> Tensor:
@@ -176,7 +180,10 @@ def _initial_density_offset(ctx: InitContext, amplitude: float, norm: float) -> 
 
 
 def cosine_density(form: Cosine, geometry: Geometry, prim: Tensor, x: Tensor) -> Tensor:
-    """Return the density (M,), 1/scene unit, unclamped, of primitives ``prim`` (M,) at points ``x`` (M, 3)."""
+    """Return sigma (M,), 1/scene unit, not clamped at 0, of primitives ``prim`` (M,) at points ``x`` (M, 3).
+
+    A hard edge is not applied: points must lie inside their primitives.
+    """
     m = geometry.length_scale[prim]
     local = (x - geometry.means[prim]) / m[:, None]
     phase = form.omega0 * ((form.W1[prim] * local[:, None, :]).sum(-1) + form.b1[prim])
@@ -190,7 +197,10 @@ def cosine_density(form: Cosine, geometry: Geometry, prim: Tensor, x: Tensor) ->
 
 
 def split_density_scale(old: Geometry, new: Geometry, edge: int = 0) -> Tensor:
-    """Return the float64 factors c, one per child, by which :func:`split_cosine` multiplies w2 and b2 of children."""
+    """Return the float64 factors c by which :func:`split_cosine` multiplies w2 and b2, one per child.
+
+    ``old`` and ``new`` are the ellipsoids of parents and children, one row per child.
+    """
     r = (new.log_length_scale.double() - old.log_length_scale.double()).exp()
     if edge == 0:
         return r
@@ -204,7 +214,7 @@ def split_cosine(
 
     W1' = r W1, b1' = b1 + W1 (mu'-mu)/m, (w2, b2)' = c (w2, b2), r = m'/m: primes mark the child, mu is the centre, m
     the longest semi-axis. With a hard edge, c = r, and sigma does not change. With a soft edge, sigma also fades inside
-    a child. Then c = r V/2V', V the product of the semi-axes, so that both children together have the weight
+    a child. Then c = r V/(2 V'), V the product of the semi-axes, so that both children together have the weight
     (1 - |y|^2)^p of their parent. Float64 keeps the change of f to the final rounding.
     """
     r, c = split_density_scale(old, new), split_density_scale(old, new, edge)
@@ -223,7 +233,7 @@ def split_cosine(
 
 
 _LOGITS = torch.linspace(-6, 6, 25, dtype=torch.float64)
-"""Logits of the tabulated opacities; opacities beyond take the nearest entry."""
+"""Logits of the opacities in the table of :func:`_gaussian_support_table`. Other opacities use the nearest entry."""
 _NODES, _FAR = 160, 5.0  # number of rings of the footprint, and its radius in standard deviations
 _WIDTHS = (1.45, 4.0)  # search interval of c
 _GOLDEN = (5**0.5 - 1) / 2
@@ -247,14 +257,21 @@ def gaussian_support(edge: int, alphas: Tensor, volume: bool = False) -> tuple[T
 
 @lru_cache
 def _gaussian_support_table(edge: int, volume: bool) -> Tensor:
-    """Return (O, 2): for O opacities o, size c by golden-section search, and log(tau / -log(1 - o)), tau the depth."""
+    """Return an (O, 2) table of the primitives whose images are closest to Gaussians, for O opacities o.
+
+    Column 0 is the size c in standard deviations, found by golden-section search. Column 1 is log(tau / -log(1 - o)),
+    tau the central optical depth.
+    """
     r = (torch.arange(_NODES, dtype=torch.float64) + 0.5) / _NODES * _FAR
     opacity = torch.sigmoid(_LOGITS)[:, None]
     bell = (-r * r / 2).exp()
     target = -torch.expm1(torch.log1p(-opacity) * bell) if volume else opacity * bell
 
     def best(c: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (O,) squared errors for sizes ``c`` (O,), and log tau, which gives both footprints equal integrals."""
+        """Return (O,) squared errors of primitives of the sizes ``c`` (O,) in the image, and (O,) log tau.
+
+        The central optical depth tau is such that primitive and Gaussian have equal integrals over the image.
+        """
         shape = (1 - (r / c[:, None]).square()).clamp_min(0) ** (edge + 0.5)
         low, high = torch.full_like(c, -12.0), torch.full_like(c, 6.0)
         for _ in range(40):
@@ -279,7 +296,9 @@ _SLACK = 1e-6  # in turns: phases this close to an end by rounding stay, so that
 def canonicalize_cosines(
     params: Params, inputs: tuple[str, ...], phase: str, weights: str, rate: float
 ) -> dict[str, Tensor]:
-    """Return equivalent cosines whose weights for the first output are at least 0, with phases from 0 to pi/rate.
+    """Return parameters of the same sum of w_k cos(rate (v_k . x + b_k)), with w_k >= 0 and b_k from 0 to pi/rate.
+
+    With several outputs, w_k >= 0 holds for the first one.
 
     Args:
         inputs: names of the frequency parameters, which multiply the inputs of the cosines, (N, K) or (N, K, ...).
@@ -315,12 +334,15 @@ def canonicalize_gain(params: Params, strength: str, log_gain: str, limit: float
 
 
 def smaller_cosine_neuron_counts(neurons: int) -> tuple[int, ...]:
-    """Return three quarters, a half and a quarter of a number of neurons, and 0."""
+    """Return the smaller numbers of neurons that are offered: 3/4, 1/2 and 1/4 of ``neurons``, rounded down, and 0."""
     return tuple(sorted({neurons * part // 4 for part in range(4)} - {neurons}, reverse=True))
 
 
 def prune_cosine_neurons(params: Params, geometry: Geometry, keep: int, omega0: float) -> dict[str, Tensor]:
-    """Keep the ``keep`` neurons of each primitive whose terms vary most; add the means of the other terms to b2."""
+    """Return the parameters with the ``keep`` neurons of each primitive whose terms of the density vary most in it.
+
+    The means of the removed terms are added to the offset b2.
+    """
     W1, phase, w2 = params["W1"].double(), omega0 * params["b1"].double(), params["w2"].double()
     semi_axes = (geometry.log_scales.double() - geometry.log_length_scale.double()[:, None]).exp()
     rotations = geometry.double().rotations
@@ -338,7 +360,7 @@ def prune_cosine_neurons(params: Params, geometry: Geometry, keep: int, omega0: 
 
 
 def ellipsoid_cosine_mean(r: Tensor) -> Tensor:
-    """Return the mean of cos(r.y) over y in the unit ball, for |r| >= 0."""
+    """Return the mean of cos(v.y) over points y in the unit ball, for vectors v of the length ``r`` >= 0."""
     small = r < 1e-2
     safe = torch.where(small, torch.ones_like(r), r)
     return torch.where(small, 1 - r * r / 10, 3 * (safe.sin() - safe * safe.cos()) / safe**3)

@@ -1,8 +1,9 @@
-"""The edge of a support: how a primitive's density fades to zero in space, or its extinction in time.
+"""The edge of a primitive: how density fades at the ellipsoid's boundary, or extinction at the ends of a time span.
 
-The weight is (1 - u^2)^p, where u is the distance from the middle divided by the distance from the middle to the edge.
-p = 0 is a hard edge, 1 and 2 are soft. On a chord that is not cut, with u in [-1, 1] and D = 1 - |y|^2 at its middle,
-the weight (1 - |y|^2)^p is D^p (1 - u^2)^p, and
+The density is multiplied by (1 - u^2)^p, where u is the distance from the middle divided by the distance from the
+middle to the edge. p = 0 is a hard edge, 1 and 2 are soft. y is the position in coordinates in which the ellipsoid is
+the unit ball. A ray crosses the ellipsoid on a chord, u in [-1, 1]. If no plane cuts the chord, the weight
+(1 - |y|^2)^p on it is D^p (1 - u^2)^p, with D = 1 - |y|^2 at its middle. A cosine with this weight has the integral
 
     1/2 integral of (1 - u^2)^p cos(phase + z u) du = N_p/2 cos(phase) B_p(z),   N = 2, 4/3, 16/15
     B_0 = sin z / z,   B_1 = 3 (B_0 - cos z)/z^2,   B_2 = 15 (B_1 - B_0)/z^2        (all 1 at z = 0)
@@ -30,7 +31,10 @@ _SERIES_BELOW, _TERMS = (
 
 
 def edge_weight(square: Tensor, edge: int) -> Tensor:
-    """Return (1 - u^2)^p from ``square`` = u^2 and ``edge`` = p; 0 where u^2 > 1, unless p = 0: 1 for every u."""
+    """Return the factor (1 - u^2)^p of a density that fades towards its edge, from ``square`` = u^2 and ``edge`` = p.
+
+    u is 0 in the middle and 1 at the edge. With p = 1 or 2, the factor is 0 where u^2 > 1; with p = 0, it is always 1.
+    """
     if edge == 0:
         return torch.ones_like(square)
     inner = (1 - square).clamp_min(0)
@@ -47,7 +51,7 @@ def sinc(z: Tensor) -> Tensor:
 
 
 def spherical_bessel(z: Tensor, last: int) -> list[Tensor]:
-    """Return j_0(z) to j_last(z), float64, differentiable everywhere; the absolute error is at most 1e-15."""
+    """Return the spherical Bessel functions j_0(z) to j_last(z), float64, differentiable; absolute error <= 1e-15."""
     small = z.abs() < _SERIES_BELOW
     safe = torch.where(small, torch.full_like(z, _SERIES_BELOW), z)
     j = [safe.sin() / safe]
@@ -68,7 +72,10 @@ def spherical_bessel(z: Tensor, last: int) -> list[Tensor]:
 
 
 def edge_legendre(c0: Tensor, c1: Tensor, c2: Tensor, edge: int) -> list[Tensor]:
-    """Return a_0 to a_2p of (c0 + c1 u + c2 u^2)^p = sum of a_n P_n(u), P_n Legendre polynomials, p = ``edge`` > 0."""
+    """Return the Legendre coefficients a_0 to a_2p of a soft edge's weight along a chord, p = ``edge``, 1 or 2.
+
+    The weight is (c0 + c1 u + c2 u^2)^p = sum of a_n P_n(u), u in [-1, 1], P_n the Legendre polynomials.
+    """
     if edge == 1:
         return [c0 + c2 / 3, c1, 2 * c2 / 3]
     d0, d1, d2, d3, d4 = c0 * c0, 2 * c0 * c1, c1 * c1 + 2 * c0 * c2, 2 * c1 * c2, c2 * c2
@@ -78,7 +85,7 @@ def edge_legendre(c0: Tensor, c1: Tensor, c2: Tensor, edge: int) -> list[Tensor]
 def soft_edge_chord_integral(
     quadratic: tuple[Tensor, Tensor, Tensor], edge: int, phase: Tensor, z: Tensor, amplitude: Tensor, offset: Tensor
 ) -> Tensor:
-    """Return the (M,) mean values along chords of a cosine density with a soft edge.
+    """Return the (M,) means of a cosine density with a soft edge along M chords, parts of rays inside an ellipsoid.
 
     The mean is 1/2 integral over [-1, 1] of (c0 + c1 u + c2 u^2)^p (offset + sum_k amplitude_k cos(phase_k + z_k u)),
     p = ``edge``, 1 or 2. ``quadratic`` holds c0, c1 and c2 of M chords, (M,) each. ``amplitude``, ``phase`` and ``z``
@@ -97,7 +104,10 @@ def soft_edge_chord_integral(
 
 
 def edge_profile(z: Tensor, order: int) -> Tensor:
-    """Return B_p(z) = (2p + 1)!! j_p(z)/z^p for p = ``order``, with the value 1 at z = 0; float64, differentiable."""
+    """Return B_p(z) = (2p + 1)!! j_p(z)/z^p for p = ``order``: the Fourier transform of (1 - u^2)^p, with B_p(0) = 1.
+
+    u is in [-1, 1], and j_p is a spherical Bessel function. Float64, differentiable.
+    """
     if order == 0:
         return sinc(z)
     small = z.abs() < 1e-3

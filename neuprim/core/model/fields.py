@@ -1,7 +1,7 @@
-"""Density fields and colour fields: the parameters of primitives, and how they *lower* to a closed form.
+"""Density fields and colour fields: they define the parameters of primitives, and *lower* them to a closed form.
 
-Before a frame is rendered, fields fold conditions such as time or light into one of a few closed forms
-(:mod:`neuprim.core.model.forms`). The renderer knows these forms, and no task.
+To lower means to apply the conditions of a frame, such as time or light, and to return one of a few closed forms
+(:mod:`neuprim.core.model.forms`). The renderer knows only these forms, so it does not depend on tasks.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ __all__ += ["Constant", "Cosine", "CustomColour", "CustomDensity", "LoweredColou
 __all__ += ["Shade", "Shading"]
 
 Conditions = Mapping[str, Tensor]
-"""Values of one frame by the name of the condition, e.g. ``{"time": tensor(0.5)}``."""
+"""Name of a condition -> its value in one frame, e.g. ``{"time": tensor(0.5)}``."""
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,11 @@ class ConditionSpec:
         parse: text of ``--NAME TEXT`` -> one tensor of ``shape`` per frame; raises
             :class:`~neuprim.core.errors.ConfigError`. If the condition is one number, neuprim splits a list and calls
             ``parse`` for each item; it expands a range itself if ``parse`` refuses it.
-        sweep: a text that animates the condition, for the commands that reports suggest; empty for none.
+        sweep: a text of ``--NAME`` that animates the condition, for commands in reports; empty for none.
         in_frames: (text, count) -> text of the same animation with ``count`` frames; None if the text states a number
             of frames.
-        place: replaces ``parse`` for positions: (text in world coordinates, world) -> positions in scene units.
+        place: function used instead of ``parse`` if the condition is a position: (text in world coordinates, world) ->
+            positions in scene units.
         of_scene: (scene settings) -> whether the views of a scene have the condition.
     """
 
@@ -82,7 +83,7 @@ class ConditionSpec:
         return self if place is None else replace(self, parse=lambda text: place(text, world))
 
     def given(self, value: Tensor, world: World) -> Tensor:
-        """Return a ``value`` of the condition as users write it: positions become float64 world coordinates."""
+        """Convert a ``value`` to what users write: positions become float64 world coordinates; other values stay."""
         return value if self.place is None else world.world_points(value)
 
 
@@ -90,15 +91,17 @@ class ConditionSpec:
 
 
 class Field(ABC):
-    """Base class of density and colour fields: parameters of each primitive, and their meaning."""
+    """Base class of density and colour fields, which define parameters of each primitive and what they mean."""
 
     init_settings: tuple[str, ...] = ()  # keys under model.init that the field's start values depend on
 
     stage: Hashable | None = None
-    """What ``lower`` depends on besides its arguments, such as the number of active SH bands: while it stays the same,
-    training steps may be replayed as a CUDA graph. None: steps are never recorded. A field with a stage computes with
-    torch operations on the device alone, never waits for it, and lowers to zero density where ``active_rows`` leaves a
-    primitive out."""
+    """State besides its arguments on which ``lower`` depends, such as the number of active SH bands.
+
+    While the state stays the same, training steps may be replayed as a CUDA graph. None: steps are never recorded.
+    A field with a stage computes with torch operations on the device alone and never waits for the device. It lowers to
+    zero density for primitives that ``active_rows`` leaves out.
+    """
 
     @abstractmethod
     def parameters(self) -> list[ParameterSpec]:
@@ -106,7 +109,7 @@ class Field(ABC):
 
     @abstractmethod
     def settings(self) -> dict[str, Any]:
-        """Return the constructor's arguments, JSON-able; ``type(self)(**settings)`` rebuilds the field from a file."""
+        """Return the constructor's arguments, JSON-able: ``type(self)(**settings)`` rebuilds the field from a file."""
 
     @classmethod
     def every_parameter(cls) -> list[ParameterSpec]:
@@ -114,12 +117,12 @@ class Field(ABC):
         return cls().parameters()
 
     def set_progress(self, progress: float) -> None:  # noqa: B027 - a hook most fields do not need
-        """Receive the used fraction 0..1 of the training budget before every step; e.g. to activate SH bands."""
+        """Set the used fraction 0..1 of the training budget, before every training step; e.g. to activate SH bands."""
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
         """Return the parameters of new primitives (children) that replace a split primitive (parent).
 
-        Children lie inside their parent and continue its field, as far as the field can.
+        Children lie inside their parent. Inside a child, density or colour stay the same, as far as the field can.
 
         Args:
             params: this field's tensors of the parents, one row per child.
@@ -129,7 +132,7 @@ class Field(ABC):
         return dict(params)
 
     def reductions(self) -> dict[str, tuple[int, ...]]:
-        """Return setting -> smaller values to which it can be reduced after training: ``{"degree": (2, 1, 0)}``."""
+        """Return setting name -> smaller values that are possible after training, e.g. ``{"degree": (2, 1, 0)}``."""
         return {}
 
     def reduce(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[Self, dict[str, Tensor]]:
@@ -177,8 +180,8 @@ class DensityField(Field):
     """Base class of density fields: the extinction sigma inside each primitive, 1/scene unit.
 
     Attributes:
-        exact_split: whether children continue their parent's sigma inside their own support. If not, as for Gaussians,
-            they must hold their parent's mass, the integral of sigma over space.
+        exact_split: whether the children of a split primitive have their parent's sigma inside their own ellipsoids. If
+            not, as for Gaussians, they must hold their parent's mass, the integral of sigma over space.
     """
 
     exact_split: bool = True
@@ -189,17 +192,18 @@ class DensityField(Field):
 
     @abstractmethod
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
-        """Return sigma (M,), 1/scene unit, unclamped, of primitives ``prim`` (M,) at points ``x`` (M, 3)."""
+        """Return sigma (M,), 1/scene unit, not clamped at 0, of primitives ``prim`` (M,) at one point ``x`` (M, 3)
+        each."""
 
     @abstractmethod
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
-        """Return the parameters of a density that is larger everywhere by ``factor`` (N,), one per primitive."""
+        """Return parameters with which the density of each primitive is multiplied by ``factor`` (N,)."""
 
     def components(self, params: Params) -> dict[str, Tensor]:
-        """Return grid name -> (N,) fraction 0..1 of each primitive's extinction that comes from this source grid.
+        """Return grid name -> (N,) fraction 0..1 of each primitive's extinction that comes from this voxel grid.
 
-        For fields fitted to several voxel grids (:attr:`neuprim.core.data.PointSamples.components`); images do not
-        depend on the fractions.
+        Only fields fitted to several voxel grids have components (:attr:`neuprim.core.data.PointSamples.components`).
+        Images do not depend on the fractions.
         """
         return {}
 
@@ -208,11 +212,11 @@ class DensityField(Field):
         return None
 
     def active_rows(self, params: Params, conditions: Conditions) -> Tensor | None:
-        """Return the ascending int64 row numbers (M,) of primitives with non-zero extinction, or None for all."""
+        """Return ascending int64 indices (M,) of the primitives with non-zero extinction, or None for all."""
         return None
 
     def move(self, params: Params, geometry: Geometry, conditions: Conditions) -> Geometry:
-        """Return the ellipsoids as they are under the conditions of a frame, e.g. moved; differentiable."""
+        """Return the ellipsoids under the conditions of a frame, e.g. moved to another place; differentiable."""
         return geometry
 
     def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
@@ -230,12 +234,13 @@ class ColourField(Field):
     channels: int  # number of channels of the images
 
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None] | None:
-        """Return the SH coefficients of the colours, ``dc`` (N, C) and ``rest`` as for
-        :func:`~neuprim.core.model.sh.sh_colors`; None for colours that are no spherical harmonics."""
+        """Return the spherical-harmonics coefficients of the colours, ``dc`` (N, C) and ``rest`` as for
+        :func:`~neuprim.core.model.sh.sh_colors`; None for fields whose colours are no spherical harmonics."""
         return None
 
     def isotropic(self, params: Params, conditions: Conditions) -> Tensor | None:
-        """Return the (N, C) part of the colour that needs neither direction nor light, at least 0; None for no part."""
+        """Return the (N, C) part of the colour, at least 0, that needs neither view direction nor light; None for no
+        part."""
         found = self.harmonics(params, conditions)
         return None if found is None else lowest_band_colors(found[0])
 

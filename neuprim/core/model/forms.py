@@ -1,7 +1,8 @@
-"""The closed forms of density and colour that fields lower to: the renderer's input, with a frame's conditions applied.
+"""Closed forms: the density and the colour of all primitives in one frame, as the renderer reads them.
 
-Each form checks its tensors and computes its values along chords (:class:`PrimitiveChords`). Fast kernels implement a
-few of the forms.
+Fields apply a frame's conditions, such as the time, to their parameters and return one of these forms. Each form checks
+its tensors and computes its values along chords (:class:`PrimitiveChords`), the parts of rays inside ellipsoids. Fast
+kernels implement only some of the forms.
 """
 
 from __future__ import annotations
@@ -33,8 +34,9 @@ from neuprim.core.model.tensors import (
 class Cosine(PrimitiveTensors):
     """Density of a cosine network: sigma(x) = (1 - |y|^2)^p f(x~) / m inside the ellipsoid |y| < 1, 0 outside.
 
-    f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2 with x~ = (x - mu) / m, m = max semi-axis. p = 0 is the hard
-    edge of the paper; 1 and 2 are soft (:mod:`neuprim.core.model.edge`). ``first + second`` adds two densities.
+    f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2 with x~ = (x - mu) / m, mu the centre, m the longest axis. y
+    is x in coordinates in which the ellipsoid is the unit ball. p = 0 is the hard edge of the paper; with 1 and 2,
+    density fades to 0 at the boundary (:mod:`neuprim.core.model.edge`). ``first + second`` adds two densities.
     """
 
     shapes: ClassVar[Shapes] = {
@@ -91,13 +93,16 @@ class Cosine(PrimitiveTensors):
         return Cosine(W1, b1, w2, b2, self.omega0, self.edge)
 
     def scaled(self, factors: Tensor) -> Cosine:
-        """Return this density multiplied by ``factors`` (N,), at least 0."""
+        """Return this density multiplied by ``factors`` (N,), one per primitive, at least 0."""
         factors = factors.to(self.b2)
         w2, b2 = self.w2 * factors[:, None], self.b2 * factors.reshape(self.b2.shape)
         return Cosine(self.W1, self.b1, w2, b2, self.omega0, self.edge)
 
     def optical_depth(self, pairs: PrimitiveChords) -> Tensor:
-        """Return (M,) float64 integrals of sigma along chords of any length, from one (cos, sinc) pair per neuron."""
+        """Return the (M,) float64 integrals of sigma along M chords, in closed form.
+
+        With a hard edge, each neuron needs one cosine and one sinc.
+        """
         prim = pairs.prim
         W1 = self.W1.double()[prim]
         phase = self.omega0 * ((W1 * pairs.local[:, None, :]).sum(-1) + self.b1.double()[prim])
@@ -114,9 +119,9 @@ class CustomDensity(PrimitiveTensors):
     """A density given by PyTorch code for pairs of ray and primitive; only the reference backend renders it.
 
     Attributes:
-        line_integral: function (prim, origin, direction, t0, t1) -> (M,) optical depths. Its arguments are primitive
-            rows (M,), ray origins and unit directions (M, 3), and ray distances of the chords' ends (M,), in scene
-            units.
+        line_integral: function (prim, origin, direction, t0, t1) -> (M,) optical depths. Its arguments are indices
+            of primitives (M,), ray origins and unit directions (M, 3), and ray distances of the chords' ends (M,), in
+            scene units.
     """
 
     edge: ClassVar[int] = 0
@@ -132,7 +137,7 @@ class CustomDensity(PrimitiveTensors):
         return CustomDensity(lambda prim, *ray: self.line_integral(index[prim], *ray))
 
     def scaled(self, factors: Tensor) -> CustomDensity:
-        """Return this density multiplied by ``factors`` (N,), at least 0."""
+        """Return this density multiplied by ``factors`` (N,), one per primitive, at least 0."""
 
         def line_integral(prim: Tensor, *ray: Tensor) -> Tensor:
             found = self.line_integral(prim, *ray)
@@ -141,12 +146,12 @@ class CustomDensity(PrimitiveTensors):
         return CustomDensity(line_integral)
 
     def optical_depth(self, pairs: PrimitiveChords) -> Tensor:
-        """Return the integrals (M,) of sigma along chords, as ``line_integral`` computes them, unchecked."""
+        """Return the (M,) integrals of sigma along M chords as ``line_integral`` returns them, without a check."""
         return self.line_integral(pairs.prim, pairs.origins, pairs.direction, *pairs.ends)
 
 
 LoweredDensity = Cosine | CustomDensity
-"""What :meth:`DensityField.lower` returns."""
+"""Density in closed form: the result type of :meth:`DensityField.lower`."""
 
 
 # ---------------------------------------------------------------- closed forms of colour
@@ -154,7 +159,7 @@ LoweredDensity = Cosine | CustomDensity
 
 @dataclass(frozen=True)
 class Constant(PrimitiveTensors):
-    """One colour per primitive and view, of any number of channels C."""
+    """A colour that is constant inside each primitive, for one view; any number of channels C."""
 
     per_primitive: ClassVar[bool] = True
     shapes: ClassVar[Shapes] = {"rgb": (("N", "C"),)}
@@ -175,16 +180,16 @@ class Constant(PrimitiveTensors):
         return Constant(rgb if self.ambient is None else rgb + self.ambient)
 
     def chord_colours(self, pairs: PrimitiveChords) -> Tensor:
-        """Return the (M, C) float64 colours that rays see along chords."""
+        """Return the (M, C) float64 colours of M chords: those of their primitives."""
         return self.rgb.double()[pairs.prim]
 
     def at_primitive_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
-        """Return the (N, C) colours at the centres of the primitives, seen from ``position`` (3,)."""
+        """Return the (N, C) colours at the centres of the primitives; the arguments do not matter."""
         return self.rgb
 
     @property
     def flat(self) -> Tensor:
-        """The (N, C) colours, each valid everywhere in its primitive."""
+        """Colours (N, C) that are valid everywhere in their primitives; None in forms whose colours vary there."""
         return self.rgb
 
 
@@ -193,7 +198,8 @@ class CustomColour(PrimitiveTensors):
     """A colour given by PyTorch code for pairs of ray and primitive; only the reference backend renders it.
 
     Attributes:
-        radiance: function (prim, x, d) -> (M, C) colours, for (M,) primitive rows, (M, 3) chord middles and directions.
+        radiance: function (prim, x, d) -> (M, C) colours, for primitive indices (M,), chord middles (M, 3), scene
+            units, and ray directions (M, 3).
     """
 
     per_primitive: ClassVar[bool] = False
@@ -219,11 +225,11 @@ class CustomColour(PrimitiveTensors):
         return CustomColour(radiance, self.channels)
 
     def chord_colours(self, pairs: PrimitiveChords) -> Tensor:
-        """Return the (M, C) colours that rays see along chords, as ``radiance`` computes them, unchecked."""
+        """Return the (M, C) colours of M chords as ``radiance`` returns them, without a check."""
         return self.radiance(pairs.prim, pairs.points, pairs.direction)
 
     def at_primitive_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
-        """Return the (N, C) colours at the centres of the primitives, seen from ``position`` (3,), unchecked."""
+        """Return the (N, C) colours at the centres of primitives for a camera at ``position`` (3,), without a check."""
         means = geometry.means
         directions = torch.nn.functional.normalize(means - position.to(means), dim=1)
         return self.radiance(torch.arange(geometry.count, device=means.device), means, directions)
@@ -271,13 +277,13 @@ class RayNet(PrimitiveTensors):
         return RayNet(self.Wx, self.bias, self.Wout * factors[:, None, None], self.base * factors[:, None])
 
     def primitive_radiance(self, prim: Tensor, local: Tensor) -> Tensor:
-        """Return (M, C) float64 colours of primitives ``prim`` (M,) at ``local`` = x~_m (M, 3); differentiable."""
+        """Return (M, C) float64 colours of primitives ``prim`` (M,) at ``local``, (x - mu)/m (M, 3); differentiable."""
         phase = (self.Wx.double()[prim] * local[:, None, :]).sum(-1) + self.bias.double()[prim]
         mixed = (self.Wout.double()[prim] * phase.cos()[:, None, :]).sum(-1)
         return (self.base.double()[prim] + mixed).clamp_min(0)
 
     def chord_colours(self, pairs: PrimitiveChords) -> Tensor:
-        """Return the (M, C) float64 colours that rays see along chords; differentiable."""
+        """Return the (M, C) float64 colours of M chords, evaluated at their middles; differentiable."""
         return self.primitive_radiance(pairs.prim, pairs.local)
 
     def at_primitive_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
@@ -287,12 +293,14 @@ class RayNet(PrimitiveTensors):
 
 
 LoweredColour = Constant | RayNet | CustomColour
-"""What :meth:`ColourField.lower` returns. ``per_primitive``: whether, in one view, the colour at a primitive's centre
-may replace the colour of the whole primitive, exactly (:class:`Constant`) or approximately (:class:`RayNet`)."""
+"""Colour in closed form: the result type of :meth:`ColourField.lower`.
+
+The attribute ``per_primitive`` states whether, in one view, the colour at a primitive's centre may replace the colour
+of the whole primitive, exactly (:class:`Constant`) or approximately (:class:`RayNet`).
+"""
 
 Shade = Callable[[Tensor], Tensor]
-"""Function of the (M, 3) float64 scene points that pixels show, which returns (M,) factors on their light, without
-gradient."""
+"""Function (scene points (M, 3), float64, that M pixels show) -> (M,) factors on the pixels' light, no gradient."""
 
 
 @dataclass(frozen=True)

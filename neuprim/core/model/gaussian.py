@@ -1,11 +1,11 @@
-"""A true Gaussian density, as a baseline for comparisons; only the reference backend renders Gaussian densities.
+"""A true Gaussian density, as a baseline for comparisons. Only the reference backend (float64 PyTorch) renders it.
 
-With y = diag(1/s) R^T (x - mu) the whitened point and c standard deviations at the support's edge |y| = 1,
+    sigma(x) = kappa/m exp(-c^2 |y|^2 / 2)   inside the ellipsoid |y| < 1, 0 outside,   m = max(s)
 
-    sigma(x) = kappa/m exp(-c^2 |y|^2 / 2)   inside the ellipsoid, 0 outside,   m = max(s)
-
-which is the Gaussian of 3D Gaussian splatting (Kerbl et al. 2023) as a density in space: along a ray the exponent is
-quadratic in t and the optical depth is a difference of two erf.
+y = diag(1/s) R^T (x - mu) is x in coordinates in which the ellipsoid, with centre mu, semi-axes s and rotation R, is
+the unit ball. c is the number of standard deviations from centre to boundary, and kappa a learned amplitude. This is
+the Gaussian of 3D Gaussian splatting (Kerbl et al. 2023) as a density in space. Along a ray, the exponent is quadratic
+in the ray distance, and the optical depth is a difference of two erf values.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 __all__ = ["GaussianDensity"]
 
 _SHORT = 0.2
-"""Intervals with w (1 + |u|) below this are integrated by their Taylor series: differences of erfc lose a digit per
-decade of w."""
+"""Intervals [u - w, u + w] with w (1 + |u|) below this value are integrated by a Taylor series, because differences of
+erfc lose one digit per decade of w."""
 _TERMS = 8  # of that series; the first one left out is below 1e-17 of the sum
 _START = 0.02, 0.98  # range to which the opacities of starting points are clamped
 _FAINTEST = 1e-30  # a density scaled by zero keeps a finite logarithm
@@ -65,7 +65,10 @@ class GaussianDensity(DensityField):
         return (depth / ctx.thickness / central).log().float()[:, None]
 
     def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the size of the support, c standard deviations for every primitive, and ``alphas`` unchanged."""
+        """Return size and opacity of primitives that replace Gaussians with the opacities ``alphas`` (N,).
+
+        The size, (N,), is the distance from centre to boundary, c standard deviations for all. Opacities are unchanged.
+        """
         return torch.full_like(alphas, self.deviations), alphas
 
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> CustomDensity:
@@ -76,7 +79,8 @@ class GaussianDensity(DensityField):
 
             I = kappa/m sqrt(2/a)/c exp(-c^2 x.x / 2) B(c sqrt(a/2) u, c sqrt(a/2) (t1 - t0)/2)
 
-        where B(u, w) is :func:`bell_integral`. Only ray origin minus centre grows with the camera's distance.
+        where B(u, w) is :func:`bell_integral`. The chord middle is computed relative to the primitive's centre, so the
+        other terms do not grow with the camera's distance.
         """
         c = self.deviations
         whiten = geometry.rotations.double().transpose(1, 2) / geometry.scales.double()[:, :, None]
@@ -108,9 +112,10 @@ class GaussianDensity(DensityField):
         return peak[prim] * (-0.5 * self.deviations**2 * (y * y).sum(-1)).exp()
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
-        """Return children with half their parent's mass each: kappa'/m' prod s' = (1/2) kappa/m prod s.
+        """Return the parameters of children with half the mass (integral of sigma over space) of their parents each.
 
-        No Gaussian continues another inside a smaller support, so this split changes the image.
+        kappa'/m' prod s' = (1/2) kappa/m prod s; primes mark the child, s are the semi-axes and m is the longest one. A
+        Gaussian in a smaller ellipsoid cannot continue its parent's Gaussian, so this split changes the image.
         """
         grown = (new.log_scales.double() - old.log_scales.double()).sum(-1)
         longer = new.log_length_scale.double() - old.log_length_scale.double()
@@ -121,7 +126,8 @@ class GaussianDensity(DensityField):
         }
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
-        """Return the parameters with kappa times max(``factor``, 1e-30); a negative ``factor`` is a ValueError."""
+        """Return the parameters with kappa, the amplitude, multiplied by max(``factor``, 1e-30), ``factor`` (N,); raise
+        ValueError if a factor is negative."""
         if bool((factor < 0).any()):
             raise ValueError(f"density factor {float(factor.min())}; a Gaussian's must not be negative")
         shift = factor.to(params["log_amplitude"]).clamp_min(_FAINTEST).log()
@@ -144,7 +150,8 @@ def bell_integral(u: Tensor, w: Tensor) -> Tensor:
 
 
 def _gaussian_series(u: Tensor, w: Tensor) -> Tensor:
-    """Sum the Taylor series of :func:`bell_integral`; scaled polynomials P_n = w^n H_n(u)/n! keep every term small."""
+    """Return :func:`bell_integral` for short intervals, by its Taylor series. The scaled polynomials P_n = w^n
+    H_n(u)/n!, H_n the Hermite polynomials, keep every term small."""
     low, high = torch.ones_like(u), 2 * u * w  # P_0, P_1;  P_(n+1) = 2 (u w P_n - w^2 P_(n-1)) / (n + 1)
     total = low
     for n in range(1, 2 * _TERMS - 1, 2):

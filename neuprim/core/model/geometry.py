@@ -1,4 +1,4 @@
-"""Ellipsoids: centre, log semi-axes, orientation."""
+"""Ellipsoids (centres, semi-axes, orientations), and chords: the parts of rays inside ellipsoids."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Geometry(PrimitiveTensors):
     Attributes:
         means: (N, 3) centres, scene units.
         log_scales: (N, 3) natural logarithms of the semi-axes, scene units.
-        quats: (N, 4) wxyz, any non-zero norm.
+        quats: (N, 4) orientations as quaternions wxyz, of any non-zero norm.
     """
 
     shapes: ClassVar[Shapes] = {"means": (("N", 3),), "log_scales": (("N", 3),), "quats": (("N", 4),)}
@@ -52,18 +52,18 @@ class Geometry(PrimitiveTensors):
 
     @property
     def log_length_scale(self) -> Tensor:
-        """Logarithm of the longest semi-axis m, (N,). If axes are equal, the first one gets the gradient."""
+        """Natural logarithms of the longest semi-axes, (N,). If axes are equal, the first one gets the gradient."""
         first = self.log_scales.argmax(dim=-1, keepdim=True)
         return self.log_scales.gather(-1, first)[..., 0]
 
     @property
     def length_scale(self) -> Tensor:
-        """Longest semi-axis m, (N,), scene units: the length scale of the fields."""
+        """Longest semi-axes m, (N,), scene units. Density and colour of a primitive use m as the unit of length."""
         return self.log_length_scale.exp()
 
     @property
     def detached_length_scale(self) -> Tensor:
-        """:attr:`length_scale` without gradient, in a fifth of the time: ties do not matter, so no argmax is needed."""
+        """Longest semi-axes, (N,), scene units, without gradient; five times as fast as :attr:`length_scale`."""
         return self.log_scales.detach().amax(-1).exp()
 
     @property
@@ -96,17 +96,17 @@ GEOMETRY_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("log_scales", (3,), 2e-2, _initial_log_scales),
     ParameterSpec("quats", (4,), 1e-2, _initial_quats),
 )
-"""Parameters of the ellipsoids, ten values per primitive; they come first in every model."""
+"""Specifications of the ellipsoids' parameters, ten values per primitive. They come first in every model."""
 
 
 @dataclass(frozen=True)
 class PrimitiveChords:
-    """M chords, one for each pair of a ray and a primitive that it crosses; float64, differentiable.
+    """M chords, each the part of one ray inside one primitive's ellipsoid; float64, differentiable.
 
     The unit of length is m, the longest semi-axis of the primitive, unless stated.
 
     Attributes:
-        prim: (M,) int64 rows of the primitives.
+        prim: (M,) int64 indices of the primitives.
         direction: (M, 3) unit vectors along the rays, scene axes.
         local: (M, 3) middles x of the chords as (x - mu)/m, mu the primitive's centre, scene axes.
         half: (M,) half lengths of the chords, in m.
@@ -114,7 +114,7 @@ class PrimitiveChords:
         near, far, middle: (M,) ends and middles of the chords, as ray distances in m.
         m: (M,) longest semi-axes, scene units.
         whitened: (M, 3) middles of the chords in whitened space, where the ellipsoid is the unit ball.
-        pace: (M, 3) derivative of whitened positions along the ray with respect to the ray distance in m.
+        pace: (M, 3) change of the whitened position when the ray distance grows by m.
     """
 
     prim: Tensor
@@ -133,7 +133,10 @@ class PrimitiveChords:
     def of(
         cls, geometry: Geometry, prim: Tensor, origin: Tensor, direction: Tensor, t0: Tensor, t1: Tensor
     ) -> PrimitiveChords:
-        """Return the chords, or parts of chords, between ray distances ``t0`` and ``t1``, (M,) each, scene units."""
+        """Return the chords from ray distances ``t0`` to ``t1``, (M,) each, scene units, or parts of chords.
+
+        ``prim`` (M,) are indices into ``geometry``. Rays have the starts ``origin`` and the unit ``direction`` (M, 3).
+        """
         m = geometry.length_scale.double()[prim]
         middle = (t0 + t1) / 2
         local = (origin + middle[:, None] * direction - geometry.means.double()[prim]) / m[:, None]
@@ -157,7 +160,10 @@ class PrimitiveChords:
 
     @property
     def support(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Coefficients c0, c1, c2, (M,) each, of 1 - |y|^2 = c0 + c1 u + c2 u^2 along the chords, u in [-1, 1]."""
+        """Coefficients c0, c1, c2, (M,) each, of 1 - |y|^2 = c0 + c1 u + c2 u^2 along the chords.
+
+        y is the whitened position, |y| = 1 on the ellipsoid. u runs from -1 at a chord's start to 1 at its end.
+        """
         step = self.half[:, None] * self.pace
         return 1 - self.whitened.square().sum(-1), -2 * (self.whitened * step).sum(-1), -step.square().sum(-1)
 

@@ -1,10 +1,11 @@
-"""Colours of spherical Gaussian lobes: a base colour and a few smooth bumps over the directions of view.
+"""View-dependent colours from spherical Gaussian lobes: a base colour plus smooth peaks around a few directions.
 
     c(d) = max(0, C0 dc + 1/2 + sum_l a_l exp(s_l (m_l . d - 1)))
 
-d is the unit direction from the camera to the primitive's centre, a_l the amplitude, one number per channel,
-m_l = axis_l / |axis_l| the axis and s_l = exp(log s_l) the sharpness of lobe l. Spherical Gaussians of this form are
-those of Wang et al. 2009 (All-frequency rendering of dynamic, spatially-varying reflectance).
+d is the unit direction from the camera to the primitive's centre, and C0 dc + 1/2 is the base colour. Lobe l has the
+amplitude a_l, one number per channel, the axis m_l = axis_l / |axis_l| and the sharpness s_l = exp(log s_l). Spherical
+Gaussians of this form are those of Wang et al. 2009 (All-frequency rendering of dynamic, spatially-varying
+reflectance).
 """
 
 from __future__ import annotations
@@ -22,15 +23,16 @@ from neuprim.core.model.tensors import Sizes, primitive_tensors_fault
 __all__ = ["lobe_colors"]
 
 AMPLITUDE, AXIS, LOG_SHARPNESS = "lobe_amplitude", "lobe_axis", "lobe_log_sharpness"
-"""Names of the parameters (N, L, C), (N, L, 3) and (N, L)."""
+"""Names of the parameters of lobes: (N, L, C), (N, L, 3) and (N, L), for L lobes per primitive and C channels."""
 
 
 def lobe_colors(
     means: Tensor, dc: Tensor, amplitude: Tensor, axis: Tensor, log_sharpness: Tensor, origin: Tensor
 ) -> Tensor:
-    """Return (N, C) colours of spherical Gaussian lobes, in the colour space of the images; one kernel for float32.
+    """Return the (N, C) colours of primitives with spherical Gaussian lobes, in the colour space of the images.
 
-    c(d) = max(0, C0 dc + 1/2 + sum_l a_l exp(s_l (m_l . d - 1))), d the unit direction from the camera.
+    c(d) = max(0, C0 dc + 1/2 + sum_l a_l exp(s_l (m_l . d - 1))), d the unit direction from the camera to the centre.
+    Float32 tensors are computed by one compiled kernel.
 
     Args:
         means: (N, 3) centres of the primitives, scene units.
@@ -41,7 +43,7 @@ def lobe_colors(
         origin: (3,) position of the camera.
 
     Raises:
-        FormError: a tensor does not fit.
+        FormError: a tensor has a wrong type, shape or device, or there are more than 8 lobes.
     """
     sizes: Sizes = {}
     fault = primitive_tensors_fault(
@@ -85,15 +87,15 @@ def _unit_or_zero(vectors: Tensor) -> Tensor:
 
 
 def random_lobe_axes(count: int, lobes: int, generator: torch.Generator) -> Tensor:
-    """Draw (count, lobes, 3) float32 unit vectors, uniform over the sphere."""
+    """Draw the lobe axes of ``count`` primitives: (count, lobes, 3) float32 unit vectors, uniform over the sphere."""
     drawn = torch.randn((count, lobes, 3), generator=generator, dtype=torch.float64)
     return _unit_or_zero(drawn).float()
 
 
 def reduce_lobes(params: Params, keep: int) -> dict[str, Tensor]:
-    """Keep the ``keep`` lobes of each primitive that vary most over the sphere of directions.
+    """Return the parameters with the ``keep`` lobes of each primitive that vary most over the sphere of directions.
 
-    The mean colours of the removed lobes are added to the base colour.
+    The mean colours of the removed lobes over all directions are added to the base colour.
     """
     amplitude = params[AMPLITUDE].double()
     s = params[LOG_SHARPNESS].double().clamp(-LOG_LIMIT, LOG_LIMIT).exp()

@@ -37,7 +37,11 @@ __all__ = ["ActivePrimitives", "LoweredPrimitives", "Primitives"]
 
 @dataclass(frozen=True)
 class LoweredPrimitives:
-    """The input of the renderer for one frame: ellipsoids with closed forms of density and colour."""
+    """The renderer's input for one frame: ellipsoids with their density and colour in closed form.
+
+    Closed forms are formulas of :mod:`neuprim.core.model.forms`, in which the frame's conditions, such as the time, are
+    already applied.
+    """
 
     geometry: Geometry
     density: LoweredDensity
@@ -47,7 +51,7 @@ class LoweredPrimitives:
     fields: tuple[str, str] | None = None  # class names of the fields, for messages
 
     def check(self, viewmat: Any = None, background: Any = None) -> None:
-        """Raise FormError if a tensor has a wrong type, shape or device."""
+        """Raise FormError if a tensor, ``viewmat`` (4, 4) or ``background`` (C,) has a wrong type, shape or device."""
         density, colour = self.fields or (None, None)
         sizes = check_geometry(self.geometry, "geometry")
         check_lowered_density(self.density, sizes, density)
@@ -57,9 +61,10 @@ class LoweredPrimitives:
         self.check_frame(viewmat, background)
 
     def check_finite(self) -> None:
-        """Raise NonFiniteError for the first primitive with a value, quaternion or scale that cannot be rendered.
+        """Raise NonFiniteError for the first primitive that cannot be rendered.
 
-        The kernels of the backends make the same check while they prepare a frame.
+        Its parameters have a NaN or infinite value, a zero quaternion, or semi-axes beyond the range of float32. The
+        kernels of the backends make the same check while they prepare a frame.
         """
         g = self.geometry
         if not g.count:
@@ -78,7 +83,10 @@ class LoweredPrimitives:
                 raise non_finite_primitive_error(tensors, int(bad.nonzero()[0]))
 
     def check_frame(self, viewmat: Any, background: Any) -> None:
-        """Check shading, background, viewmat and devices; raise FormError. :meth:`Primitives.lower` checks the rest."""
+        """Raise FormError if ``shade``, ``background`` (C,), ``viewmat`` (4, 4) or the devices of tensors are invalid.
+
+        :meth:`Primitives.lower` checks everything else.
+        """
         if self.shade is not None and (fault := function_fault(self.shade)) is not None:
             raise FormError(f"{self.owner('colour')}: shade has {fault} or None")
         if background is not None:
@@ -117,27 +125,27 @@ class LoweredPrimitives:
         )
 
     def owner(self, kind: Literal["density", "colour"]) -> str:
-        """Return the name of the field for messages: ``"density field Waves"``."""
+        """Return the label of the density or colour field for messages, such as ``"density field Waves"``."""
         return model_field_label(kind, None if self.fields is None else self.fields[kind == "colour"])
 
     def source(self, kind: Literal["density", "colour"]) -> str:
-        """Return the names of field and closed form for messages, ``"density field Waves lowered to Cosine"``."""
+        """Return a label of field and closed form for messages, ``"density field Waves lowered to Cosine"``."""
         return f"{self.owner(kind)} lowered to {type(getattr(self, kind)).__name__}"
 
     def center_colors(self, position: Tensor) -> Tensor:
-        """Return the (M, C) colours at the primitives' centres, seen from ``position`` (3,)."""
+        """Return the (M, C) colours at the centres of the M primitives for a camera at ``position`` (3,)."""
         found = self.colour.at_primitive_centers(self.geometry, position)
         return check_primitive_field_result(
             found, (self.geometry.count, self.colour.channels), f"{self.source('colour')}: radiance"
         )
 
     def optical_depth(self, pairs: PrimitiveChords) -> Tensor:
-        """Return the (M,) float64 integrals of sigma along chords, unclamped."""
+        """Return the optical depths (M,) of M chords, float64: integrals of sigma along them, not clamped at 0."""
         found = self.density.optical_depth(pairs)
         return check_primitive_field_result(found, (len(pairs),), f"{self.source('density')}: line_integral").double()
 
     def chord_colours(self, pairs: PrimitiveChords) -> Tensor:
-        """Return the (M, C) float64 colours that rays see along chords."""
+        """Return the (M, C) float64 colours that M chords send to the camera, one colour per chord."""
         found = self.colour.chord_colours(pairs)
         return check_primitive_field_result(
             found, (len(pairs), self.colour.channels), f"{self.source('colour')}: radiance"
@@ -146,7 +154,7 @@ class LoweredPrimitives:
 
 @dataclass(frozen=True)
 class ActivePrimitives:
-    """The M primitives whose extinction is not zero under the conditions of a frame."""
+    """The M active primitives of a frame: those whose extinction is not zero under the frame's conditions."""
 
     field: DensityField
     conditions: Conditions
@@ -157,7 +165,10 @@ class ActivePrimitives:
     geometry: Geometry  # ellipsoids under the conditions of the frame, e.g. moved
 
     def sigma(self, prim: Tensor, x: Tensor) -> Tensor:
-        """Return sigma (P,), 1/scene unit, unclamped, of active primitives ``prim`` (P,) at points ``x`` (P, 3)."""
+        """Return the extinction sigma (P,), 1/scene unit, not clamped at 0, at the points ``x`` (P, 3).
+
+        ``prim`` (P,) gives the primitive of each point, as an index into the active primitives.
+        """
         found = self.field.density(self.own, self.stored, prim, x, self.conditions)
         return check_primitive_field_result(found, (len(prim),), model_method_label(self.field, "density"))
 
@@ -190,7 +201,7 @@ class Primitives:
 
     @classmethod
     def initialise(cls, density: DensityField, colour: ColourField, context: InitContext) -> Primitives:
-        """Return new primitives with the start values of their parameters; raises FormError for wrong shapes."""
+        """Return a new model whose parameters have their start values; raise FormError if their shapes are wrong."""
         own = [("starting points", spec) for spec in GEOMETRY_SPECS]
         own += [
             (model_method_label(field, "parameters"), spec)
@@ -219,21 +230,23 @@ class Primitives:
         return Geometry(self.params["means"], self.params["log_scales"], self.params["quats"])
 
     def of(self, field: DensityField | ColourField) -> dict[str, Tensor]:
-        """Return the tensors of one of the two fields, by name."""
+        """Return parameter name -> tensor for the parameters of ``field``, the model's density or colour field."""
         return self._of(field, self.params)
 
     def _of(self, field: DensityField | ColourField, params: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return the tensors that belong to one field, by name, from ``params``, the tensors of the whole model."""
+        """Return those of ``params``, name -> tensor for the whole model, that belong to ``field``."""
         return {name: params[name] for name in self._names[field is self.colour]}
 
     def lower(
         self, camera: AnyCamera, conditions: Conditions, settings: RenderSettings | None = None, shaded: bool = True
     ) -> LoweredPrimitives:
-        """Return the renderer's input for a frame: closed forms without inactive primitives; differentiable.
+        """Return the renderer's input for one frame: ellipsoids, density and colour in closed form; differentiable.
+
+        Primitives without extinction in this frame are left out, except on a GPU if the density field has a ``stage``.
 
         Args:
             settings: render settings of images that a colour field renders itself (shadow maps); None: the defaults.
-            shaded: whether to apply :meth:`~neuprim.core.model.fields.ColourField.shade`.
+            shaded: whether to apply the factors (shadows) of :meth:`~neuprim.core.model.fields.ColourField.shade`.
 
         Raises:
             FormError: a field returned tensors of a wrong type, shape or device.
@@ -256,12 +269,13 @@ class Primitives:
         return LoweredPrimitives(geometry, density, colour, active.rows, shading.pixels, names)
 
     def lower_density(self, conditions: Conditions) -> tuple[Geometry, LoweredDensity]:
-        """Return geometry and closed form of the density for the active primitives of a frame."""
+        """Return ellipsoids, and density in closed form, of a frame's active primitives (those with extinction)."""
         active = self.active(conditions)
         return active.geometry, self._lower_density(active)[0]
 
     def _lower_density(self, active: ActivePrimitives) -> tuple[LoweredDensity, Sizes]:
-        """Return the density, checked, and the sizes that its tensors share with the geometry."""
+        """Return the checked closed form of the density, and the sizes (such as N) that it shares with the geometry;
+        raise FormError for invalid tensors."""
         sizes = check_geometry(active.geometry, "geometry")
         try:
             density = self.density.lower(active.own, active.geometry, active.conditions)
@@ -271,7 +285,10 @@ class Primitives:
         return density, sizes
 
     def component(self, name: str) -> Primitives:
-        """Return a model with only the extinction from the source grid ``name``; raises KeyError if there is none."""
+        """Return a model with only that part of the extinction that comes from the voxel grid ``name`` of the source.
+
+        Raises KeyError if the density field does not know the grid.
+        """
         own = {key: value.detach() for key, value in self.of(self.density).items()}
         scaled = self.density.scale_density(own, self.density.components(own)[name])
         return Primitives(self.density, self.colour, {**self.params, **scaled})
@@ -280,7 +297,7 @@ class Primitives:
     def limit(self, largest: float, when: Tensor | None = None) -> None:
         """Scale the densities of primitives in place, so that none exceeds the extinction ``largest``, 1/scene unit.
 
-        ``when`` is (1,) bool on the device; if it is False, all stay as they are.
+        Nothing changes if the density field knows no upper bound, or if ``when``, a (1,) bool on the device, is False.
         """
         own = self.of(self.density)
         found = self.density.largest(own, self.geometry)
@@ -294,9 +311,9 @@ class Primitives:
     def active(
         self, conditions: Conditions, dtype: torch.dtype | None = None, everything: bool = False
     ) -> ActivePrimitives:
-        """Return the active primitives of a frame; differentiable. With ``dtype``, they are detached and of this dtype.
+        """Return the active primitives of a frame, those with extinction; differentiable unless ``dtype`` is given.
 
-        ``everything`` keeps inactive primitives, too.
+        With ``dtype``, tensors are detached and converted. ``everything`` includes the inactive primitives, too.
         """
         rows = None if everything else self.density.active_rows(self.of(self.density), conditions)
         params = self.params
@@ -324,7 +341,7 @@ class Primitives:
         )
 
     def rows(self, index: Tensor) -> dict[str, Tensor]:
-        """Return parameter name -> detached copy of the rows ``index``, for every parameter."""
+        """Return parameter name -> detached copy of the values of the primitives ``index``, for all parameters."""
         return {name: value.detach()[index].clone() for name, value in self.params.items()}
 
     def check_finite(self, what: str = "parameter") -> None:
@@ -348,10 +365,8 @@ def reduction_names(density: DensityField, colour: ColourField) -> list[str]:
 
 
 def validate_reduction(density: DensityField, colour: ColourField, kind: str, name: str, value: Any) -> int:
-    """Return ``value`` if the setting ``name`` of a field can be reduced to it, or raise ConfigError.
-
-    ``kind`` is "density" or "colour".
-    """
+    """Return ``value`` if the setting ``name`` of the field ``kind`` ("density" or "colour") can be reduced to it, e.g.
+    "neurons" of the density to 4; otherwise raise ConfigError."""
     field = density if kind == KINDS[0] else colour
     offered = field.reductions()
     if name not in offered:
@@ -365,8 +380,11 @@ def validate_reduction(density: DensityField, colour: ColourField, kind: str, na
 
 
 def reduce_model(model: Primitives, kind: str, name: str, value: int) -> Primitives:
-    """Return the model with the setting ``name`` of one field reduced to ``value``, as close to the original as
-    possible. Changed tensors are detached."""
+    """Return the model with a setting of one field, e.g. its number of neurons, reduced to ``value``.
+
+    ``kind`` selects the field, "density" or "colour"; ``name`` is the setting. The result is as close to the original
+    as possible. Changed tensors are detached.
+    """
     own = model.density if kind == KINDS[0] else model.colour
     tensors = {key: value.detach() for key, value in model.of(own).items()}
     field, reduced = own.reduce(tensors, model.geometry, name, value)
@@ -380,7 +398,10 @@ def reduce_model(model: Primitives, kind: str, name: str, value: int) -> Primiti
 def reduce_fields(
     density: DensityField, colour: ColourField, overrides: Sequence[str]
 ) -> tuple[DensityField, ColourField]:
-    """Apply the reductions of the setting ``model.reduced``, in order, to fields that have no parameters yet."""
+    """Return both fields after the reductions ``overrides``, such as ``"density.neurons=4"``, in order.
+
+    The texts are the setting ``model.reduced``. Fields have no parameters yet. Raises ConfigError for an invalid text.
+    """
     for word in overrides:
         key, equals, text = word.partition("=")
         kind, dot, name = key.partition(".")

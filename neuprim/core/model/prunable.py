@@ -1,8 +1,8 @@
 """Prunable units: groups of parameter elements, such as a neuron, that pruning can set to zero in single primitives.
 
-Pruning decides for each primitive which units stay. A file stores a parameter sparsely where that takes less space, as
-two tensors. ``NAME|there``, uint8, has one bit per element, row by row and lowest bit first. ``NAME|numbers``, float32,
-has the elements whose bit is set.
+Pruning decides for each primitive which units stay. A file stores a parameter NAME sparsely where that takes less
+space, as two tensors. ``NAME|there``, uint8, has one bit per element, row by row and lowest bit first; 1 means that the
+element is stored. ``NAME|numbers``, float32, holds the stored elements. All others are zero.
 """
 
 from __future__ import annotations
@@ -25,27 +25,25 @@ Index = tuple[int | slice, ...]  # index into a parameter, behind the axis of th
 
 @dataclass(frozen=True)
 class PrunableUnit:
-    """Elements of a field's parameters that pruning sets to zero together, such as one neuron."""
+    """A group of parameter elements of a field that pruning sets to zero together, such as one neuron."""
 
     name: str  # unique within the field, e.g. "neuron 2"
     places: Mapping[str, Index]  # parameter name -> index of the elements in a row
     group: str = ""  # label under which reports add up units, e.g. "band 2"; empty: the unit's name
 
     def of(self, params: Params) -> dict[str, Tensor]:
-        """Return parameter name -> elements of this unit, as (N, ...) views."""
+        """Return parameter name -> elements of this unit in all N primitives, an (N, ...) view of the parameter."""
         return {name: params[name][(slice(None), *place)] for name, place in self.places.items()}
 
 
 def count_unit_numbers(unit: PrunableUnit, params: Params) -> int:
-    """Return how many parameter elements a unit has in one primitive."""
+    """Return the number of parameter elements that a unit has in one primitive."""
     return sum(math.prod(value.shape[1:]) for value in unit.of(params).values())
 
 
 def primitive_unit_removal_effect(unit: PrunableUnit, params: Params, gradients: Params) -> Tensor:
-    """Return (N,) sums over the unit of value times gradient.
-
-    To first order, setting the unit to zero changes the differentiated loss by minus this sum.
-    """
+    """Return (N,) sums of value times gradient over the elements of a unit, one sum per primitive. ``gradients`` are
+    those of a loss. To first order, setting the unit to zero changes the loss by minus this sum."""
     slopes = unit.of(gradients)
     parts = [_flat_primitive_rows(value.detach() * slopes[name]).sum(1) for name, value in unit.of(params).items()]
     total = parts[0]
@@ -55,10 +53,8 @@ def primitive_unit_removal_effect(unit: PrunableUnit, params: Params, gradients:
 
 
 def zero_units(units: Mapping[str, tuple[PrunableUnit, Tensor]], params: Params) -> dict[str, Tensor]:
-    """Return copies of the parameters in which some primitives' units are zero.
-
-    ``units`` maps a name to (unit, (N,) bool of the primitives that lose the unit).
-    """
+    """Return the parameters after setting units of selected primitives to zero; changed tensors are copies. ``units``
+    maps a unit's name to (unit, (N,) bool that is True for the primitives in which the unit becomes zero)."""
     changed = {name for unit, gone in units.values() if bool(gone.any()) for name in unit.places}
     found = {name: value.detach().clone() if name in changed else value for name, value in params.items()}
     for unit, gone in units.values():
@@ -69,12 +65,12 @@ def zero_units(units: Mapping[str, tuple[PrunableUnit, Tensor]], params: Params)
 
 
 def primitives_with_unit(unit: PrunableUnit, params: Params) -> Tensor:
-    """Return (N,) bool of the primitives in which some element of the unit is not zero."""
+    """Return (N,) bool, True for primitives in which at least one element of the unit is not zero."""
     return torch.stack([_flat_primitive_rows(value.detach() != 0).any(1) for value in unit.of(params).values()]).any(0)
 
 
 def _flat_primitive_rows(value: Tensor) -> Tensor:
-    """Reshape to (N, elements per primitive), also for N = 0."""
+    """Reshape an (N, ...) tensor to (N, elements per primitive); N may be 0."""
     return value.reshape(len(value), math.prod(value.shape[1:]))
 
 
@@ -82,7 +78,8 @@ _MASK, _NUMBERS = "|there", "|numbers"
 
 
 def sparse_primitive_parameters(params: Params, specs: Sequence[ParameterSpec]) -> tuple[dict[str, Tensor], list[str]]:
-    """Return the tensors to write to a model file, and the names of the parameters that are stored sparsely."""
+    """Return the tensors to write to a model file, and the names of the parameters that are stored sparsely. A
+    parameter in ``specs`` is stored sparsely (bit mask and non-zero elements) if that takes less space."""
     stored, sparse = dict(params), []
     for name in (spec.name for spec in specs):
         numbers = params[name].detach().cpu().contiguous().flatten()
@@ -98,9 +95,10 @@ def sparse_primitive_parameters(params: Params, specs: Sequence[ParameterSpec]) 
 def dense_primitive_parameters(
     stored: Params, names: object, specs: Sequence[ParameterSpec], where: str
 ) -> dict[str, Tensor]:
-    """Return the dense parameters from the ``stored`` tensors of a file whose parameters ``names`` are sparse.
+    """Return dense parameters from tensors ``stored`` in a file: the inverse of :func:`sparse_primitive_parameters`.
 
-    ``where`` names the file in messages. Raises CheckpointError if tensors do not fit the ``specs`` or each other.
+    ``names`` are the parameters that are stored sparsely; ``where`` names the file in messages. Raises CheckpointError
+    if tensors do not fit the ``specs`` or each other.
     """
     shapes = {spec.name: spec.shape for spec in specs}
     if not isinstance(names, list) or not all(isinstance(name, str) and name in shapes for name in names):

@@ -1,6 +1,7 @@
-"""Compiled CPU kernels that run per primitive: gather rows of many tensors, rotations and gains.
+"""Compiled CPU kernels that run per primitive: gather rows of tensors, convert quaternions, multiply by gains.
 
-Row numbers must ascend, so that the backward pass writes a gradient in one pass.
+A row holds the values of one primitive. Row indices must ascend, so that the backward pass writes a gradient in one
+pass.
 """
 
 from __future__ import annotations
@@ -20,10 +21,8 @@ _FEW = 4096  # for fewer rows without a gradient, torch is faster than starting 
 
 
 def take_primitive_rows(tensors: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-    """Return the ``rows`` (M,) of float32 or float64 tensors (N, ...); differentiable once.
-
-    ``rows`` must be ascending int64; this is not checked.
-    """
+    """Return name -> the rows with the indices ``rows`` (M,) of each of the ``tensors`` (N, ...); differentiable once.
+    Tensors are float32 or float64. ``rows`` must be ascending int64; this is not checked."""
     if not device.on_numba(rows, *tensors.values()) or (len(rows) < _FEW and not kernel_needs_grad(*tensors.values())):
         return {name: value.index_select(0, rows) for name, value in tensors.items()}
     return dict(zip(tensors, apply_kernel_operation(_PrimitiveRows, rows, *tensors.values()), strict=True))
@@ -38,7 +37,7 @@ def _take_primitive_rows_kernel(rows, whole, taken):  # type: ignore[no-untyped-
 
 @exact_kernel
 def _put_primitive_rows_kernel(rows, taken, whole):  # type: ignore[no-untyped-def]
-    """Copy ``taken`` into the rows ``rows`` of ``whole``; all other rows become zero."""
+    """Copy row n of ``taken`` (M, C) to row ``rows[n]`` of ``whole`` (N, C); all other rows become zero."""
     row = 0
     for n in range(rows.shape[0]):
         while row < rows[n]:
@@ -54,7 +53,8 @@ def _put_primitive_rows_kernel(rows, taken, whole):  # type: ignore[no-untyped-d
 def _each_primitive_table(
     kernel: Callable[..., None], rows: np.ndarray, pairs: list[tuple[np.ndarray, np.ndarray]]
 ) -> None:
-    """Run the kernel on each (source, target) pair, reshaped to 2D tables; the pairs are divided among threads."""
+    """Call kernel(rows, source, target) for each (source, target) in ``pairs``; the pairs are divided among threads.
+    Arrays are reshaped to 2D, one row per primitive. Pairs with an empty array are skipped."""
     tables = [tuple(x.reshape(len(x), -1) for x in pair) for pair in pairs if pair[0].size and pair[1].size]
 
     def share(start: int, stop: int) -> None:
@@ -97,10 +97,8 @@ class _PrimitiveRows(torch.autograd.Function):
 
 @strict
 def ellipsoid_rotation(w, x, y, z):  # type: ignore[no-untyped-def]
-    """Return 1/|q| and the nine entries of the rotation matrix of a float64 quaternion, row by row.
-
-    In float32, the rounding of the squares would scale the matrix.
-    """
+    """Return 1/|q| and the nine entries, row by row, of the rotation matrix of the float64 quaternion q = (w, x, y, z).
+    In float32, rounding of the squares would change the scale of the matrix."""
     n = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * n, x * n, y * n, z * n
     return (
@@ -123,9 +121,10 @@ def fill_ellipsoid_rotation(q, out):  # type: ignore[no-untyped-def]
 
 @strict
 def quaternion_gradient(w, x, y, z, n, g):  # type: ignore[no-untyped-def]
-    """Return dL/dq, q = (w, x, y, z), from ``g``, the nine entries of dL/dR row by row, and ``n`` = 1/|q|.
+    """Return the gradient dL/dq of a loss L by a quaternion q = (w, x, y, z) with the rotation matrix R, four numbers.
 
-    The result is perpendicular to q, because the rotation does not depend on |q|.
+    ``g`` holds the nine entries of dL/dR row by row, and ``n`` is 1/|q|. The result is perpendicular to q, because R
+    does not depend on |q|.
     """
     g00, g01, g02, g10, g11, g12, g20, g21, g22 = g
     w, x, y, z = w * n, x * n, y * n, z * n
@@ -139,17 +138,18 @@ def quaternion_gradient(w, x, y, z, n, g):  # type: ignore[no-untyped-def]
 
 @strict
 def ellipsoid_rotation_backward(q, n, g, out):  # type: ignore[no-untyped-def]
-    """Write dL/dq into ``out`` (4,) from ``g``, dL/dR (3, 3), and ``n`` = 1/|q|."""
+    """Write the gradient dL/dq of a loss L by the quaternion ``q`` (4,) into ``out`` (4,). ``g`` (3, 3) is the gradient
+    dL/dR by the rotation matrix R of ``q``, and ``n`` is 1/|q|."""
     rows = g[0, 0], g[0, 1], g[0, 2], g[1, 0], g[1, 1], g[1, 2], g[2, 0], g[2, 1], g[2, 2]
     out[0], out[1], out[2], out[3] = quaternion_gradient(q[0], q[1], q[2], q[3], n, rows)
 
 
 @exact_kernel
 def cosine_gain_backward(w2, b2, factor, p_w2, p_b2, g_w2, g_b2, pulled):  # type: ignore[no-untyped-def]
-    """Write the gradients of w2 (N, K), b2 (N, 1) and ``factor`` (N, 1) for the products w2 factor and b2 factor.
+    """Run the backward pass of the products w2 factor and b2 factor, for w2 (N, K), b2 (N, 1) and ``factor`` (N, 1).
 
-    ``p_w2`` and ``p_b2`` are the gradients of the products; ``g_w2``, ``g_b2`` and ``pulled`` receive the results.
-    ``pulled`` is the gradient of the factor.
+    ``p_w2`` and ``p_b2`` are the gradients of the products. The gradients of w2, b2 and the factor are written into
+    ``g_w2``, ``g_b2`` and ``pulled``.
     """
     for n in range(b2.shape[0]):
         total = np.float64(p_b2[n, 0]) * b2[n, 0]
@@ -178,10 +178,8 @@ class _CosineGain(torch.autograd.Function):
 
 
 def fused_cosine_gain(w2: Tensor, b2: Tensor, log_gain: Tensor, limit: float) -> tuple[Tensor, Tensor]:
-    """Return ``w2`` (N, K) and ``b2`` (N, 1) times exp(log_gain); ``log_gain`` (N, 1) is clamped to +-``limit``.
-
-    All tensors have the same dtype.
-    """
+    """Return amplitudes ``w2`` (N, K) and offsets ``b2`` (N, 1) of cosine densities, multiplied by exp(``log_gain``).
+    ``log_gain`` (N, 1) is clamped to -``limit``..``limit``. All tensors have the same dtype."""
     if not device.on_numba(w2, b2, log_gain):
         gain = log_gain.clamp(-limit, limit).exp()
         return w2 * gain, b2 * gain

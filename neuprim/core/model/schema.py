@@ -1,4 +1,7 @@
-"""Parameters: one list of :class:`ParameterSpec` drives optimiser, population control, checkpoints and export."""
+"""Specifications of the learnable parameters of primitives, and functions for their start values.
+
+Optimiser, population control, checkpoints and export all use one list of :class:`ParameterSpec`.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ RateUnit = Literal["absolute", "extent", "pixel"]
 """Unit of a learning rate; see :class:`ParameterSpec`."""
 
 Params = Mapping[str, Tensor]
-"""Parameters by name; each tensor has shape (N, *spec.shape)."""
+"""Parameter name -> tensor (N, *shape) for N primitives; ``shape`` is that of the :class:`ParameterSpec`."""
 
 
 @dataclass
@@ -31,11 +34,11 @@ class InitContext:
         colors: (N, C) initial colours in the data set's own colour space.
         generator: the only source of random numbers.
         settings: settings of the preset under ``model.init``, e.g. ``{"alpha": 0.8}``.
-        conditions: name -> (N,) condition at which each starting point was observed, if the data set knows it.
+        conditions: condition name -> (N,) value (e.g. time) at which each starting point was observed, if known.
         axes: (N, 3) semi-axes of starting points that are ellipsoids.
         quats: (N, 4) wxyz orientations of starting points that are ellipsoids.
-        alphas: (N,) opacities 0..1 of the starting points through their centres, if known.
-        steps: condition name -> difference between neighbouring frames of a sequence.
+        alphas: (N,) opacities 0..1 of the starting points along a ray through their centres, if known.
+        steps: condition name -> difference of its value between neighbouring frames of a sequence.
     """
 
     means: Tensor
@@ -86,7 +89,7 @@ class ParameterSpec:
         lr: learning rate; ``train.rates.NAME`` overrides it. 0 means a label: not learned, stored in every file.
         init: function that draws the (N, *shape) float32 start values.
         lr_unit: factor on the rate: "absolute", 1; "extent", the data set's
-            :attr:`~neuprim.core.data.Dataset.extent`; "pixel", the size of a pixel at the median depth of the start.
+            :attr:`~neuprim.core.data.Dataset.extent`; "pixel", the size of a pixel at the median depth of the scene.
             ``train.rate_units.NAME`` overrides ``lr_unit``.
         low: lower bound of the values. With 0, a value that the model clamps at 0 keeps its gradient and can rise.
     """

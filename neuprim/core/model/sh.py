@@ -47,22 +47,24 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def lowest_band_colors(dc: Tensor) -> Tensor:
-    """Return the (N, C) colours max(0, C0 dc + 1/2), without their dependence on direction."""
+    """Return the (N, C) colours max(0, C0 dc + 1/2): the part that does not depend on direction."""
     return (dc * C0 + 0.5).clamp_min(0.0)
 
 
 def sh_colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degree: int) -> Tensor:
-    """Return the (N, C) colours max(0, SH(direction from origin to mean) + 1/2); one kernel for float32 tensors.
+    """Return the (N, C) colours max(0, SH(direction from origin to mean) + 1/2), SH a sum of spherical harmonics.
+
+    Float32 tensors are computed by one compiled kernel.
 
     Args:
         means: (N, 3) centres of the primitives, scene units.
         dc: (N, C) zero-order coefficients.
         rest: (N, at least (degree + 1)^2 - 1, C) coefficients of the higher bands; None only at degree 0.
         origin: (3,) position of the camera.
-        degree: bands in use, 0..3.
+        degree: highest band in use, 0..3.
 
     Raises:
-        FormError: a tensor does not fit.
+        FormError: a tensor has a wrong type, shape or device, or ``degree`` is invalid.
     """
     _check_sh_inputs(means, dc, rest, origin, degree)
     if degree == 0:
@@ -100,18 +102,23 @@ def _check_sh_inputs(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Ten
 
 
 def truncate_sh_bands(params: Params, name: str, degree: int) -> dict[str, Tensor]:
-    """Return the parameters without the bands of ``name`` above ``degree``: the best approximation on average."""
+    """Return the parameters without the spherical-harmonics bands above ``degree`` in the parameter ``name``.
+
+    On average over directions, this is the best approximation. With degree 0, the parameter is removed.
+    """
     kept = {key: value for key, value in params.items() if key != name}
     return {**kept, name: params[name][:, : sh_coefficient_count(degree) - 1].contiguous()} if degree else kept
 
 
 _DARKEST = 1e-3
-"""Initial colours start at least this far above zero: at zero and below, max(0, .) passes no gradient and black stays
-black."""
+"""Lowest initial colour. At 0 and below, max(0, colour) passes no gradient, so black primitives would stay black."""
 
 
 def prunable_sh_coefficients(degree: int, channels: int, name: str) -> tuple[PrunableUnit, ...]:
-    """Return a unit for each element of the coefficients ``name``, (N, (degree + 1)^2 - 1, C), in groups by band."""
+    """Return one prunable unit for each spherical-harmonics coefficient and channel, in groups by band.
+
+    The coefficients are the parameter ``name``, (N, (degree + 1)^2 - 1, ``channels``) for N primitives.
+    """
     return tuple(
         PrunableUnit(
             f"coefficient {band} {order - band:+d}, channel {c}", {name: (band * band - 1 + order, c)}, f"band {band}"
@@ -123,5 +130,8 @@ def prunable_sh_coefficients(degree: int, channels: int, name: str) -> tuple[Pru
 
 
 def initial_sh_dc(color: Tensor) -> Tensor:
-    """Return the (N, C) float32 zero-order coefficients of direction-independent colours (N, C)."""
+    """Return (N, C) float32 zero-order coefficients that give the colours ``color`` (N, C) in all directions.
+
+    Darker colours than 1e-3 are raised to 1e-3.
+    """
     return ((color.clamp_min(_DARKEST) - 0.5) / C0).float()

@@ -1,6 +1,8 @@
-"""Requirements of kernels on tensors: dtype, layout, device and shape. Letters in shapes are sizes in common.
+"""Checks of the tensors that compiled kernels read: dtype, layout, device and shape.
 
-The functions return None, or what is wrong as text; :mod:`neuprim.core.model.checks` raises the errors.
+In an allowed shape such as ("N", "K", 3), a letter stands for a size that all checked tensors share. The functions
+whose names end in ``fault`` return an error text, or None for valid input. :mod:`neuprim.core.model.checks` raises the
+errors.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ Shape = tuple[int | str, ...]  # a letter stands for a size that tensors share, 
 Sizes = dict[str, tuple[int, str]]  # letter -> its size and the tensor that has it
 
 MOST_UNITS = 256
-"""Largest number of density neurons or colour units: the fast kernels number a primitive's neurons in a byte."""
+"""Largest number of density neurons, or of hidden units of a colour network: kernels number neurons in one byte."""
 
 _ANY = (0, sys.maxsize)
 _RANGES = {"K": (0, MOST_UNITS), "H": (0, MOST_UNITS), "C": (1, sys.maxsize)}
@@ -28,7 +30,8 @@ _DTYPES = (torch.float32, torch.float64)
 
 
 def primitive_tensor_fault(value: Any) -> str | None:
-    """Return why no kernel can read a value, as ``"dtype torch.int64; expected torch.float32 or ..."``, or None."""
+    """Return why kernels cannot read ``value``, such as ``"dtype torch.int64; expected torch.float32 or ..."``, or
+    None. Kernels read dense float32 and float64 tensors on the devices that neuprim supports."""
     if not isinstance(value, Tensor):
         return f"type {type(value).__name__}; expected a torch tensor"
     if not value.is_cpu and value.device.type not in device.DEVICE_TYPES:
@@ -41,7 +44,7 @@ def primitive_tensor_fault(value: Any) -> str | None:
 
 
 def field_number_fault(value: Any) -> str | None:
-    """Return why a value is not a finite number, or None."""
+    """Return an error text if ``value`` is not a finite number, else None."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return f"type {type(value).__name__}; expected a finite number"
     if abs(value) <= sys.float_info.max:
@@ -50,13 +53,16 @@ def field_number_fault(value: Any) -> str | None:
 
 
 def function_fault(value: Any) -> str | None:
-    """Return why a value is not a function, or None."""
+    """Return an error text if ``value`` is not a function, else None."""
     return None if callable(value) else f"type {type(value).__name__}; expected a function"
 
 
 def primitive_tensors_fault(tensors: Iterable[tuple[str, Any, tuple[Shape, ...]]], sizes: Sizes) -> str | None:
-    """Return the first fault among ``tensors``, entries (name, tensor, allowed shapes): a tensor that kernels cannot
-    read or that has another shape. Returns None if all are valid. Adds the sizes found to ``sizes``."""
+    """Return an error text for the first tensor that kernels cannot read or that has a wrong shape, or None.
+
+    ``tensors`` holds entries (name, tensor, allowed shapes). ``sizes`` maps the letters in shapes to known sizes; the
+    sizes found are added.
+    """
     for name, value, shapes in tensors:
         fault = primitive_tensor_fault(value)
         if fault is None:
@@ -71,7 +77,7 @@ def primitive_tensors_fault(tensors: Iterable[tuple[str, Any, tuple[Shape, ...]]
 
 
 def labelled_fault(name: str, fault: str | None) -> str | None:
-    """Return ``"NAME has FAULT"``, or None if ``fault`` is None."""
+    """Return the error text ``"NAME has FAULT"``, or None if ``fault``, a text without the name, is None."""
     return None if fault is None else f"{name} has {fault}"
 
 
@@ -98,7 +104,7 @@ def _fits_primitive_shape(found: torch.Size, shape: Shape, name: str, sizes: Siz
 
 
 def _expected_primitive_shapes(shapes: tuple[Shape, ...], sizes: Sizes) -> str:
-    """Format shapes as numbers if all sizes are known, else as letters with the known sizes and the limits."""
+    """Format allowed shapes for a message: numbers if all sizes are known, else letters with known sizes and limits."""
     letters = list(dict.fromkeys(d for d in shapes[0] if isinstance(d, str)))
     known, free = [x for x in letters if x in sizes], [x for x in letters if x not in sizes]
     if not free:
@@ -117,21 +123,22 @@ def _expected_primitive_shapes(shapes: tuple[Shape, ...], sizes: Sizes) -> str:
 
 
 Shapes = Mapping[str, tuple[Shape, ...]]
-"""Name of a tensor -> allowed shapes; a letter is the same size in all tensors of a frame."""
+"""Name of a tensor -> allowed shapes. A letter in a shape stands for the same size in all tensors of a frame."""
 
 
 class PrimitiveTensors:
-    """A group of tensors with one row per primitive and their allowed shapes."""
+    """Base class of groups of tensors with one row per primitive, such as the tensors of a density. ``shapes`` maps the
+    names of the tensors, which are attributes of the group, to their allowed shapes."""
 
     shapes: ClassVar[Shapes] = {}
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors by their names in messages, each with one row per primitive."""
+        """Return name -> tensor with one row per primitive, for all tensors; messages use these names."""
         return {name: getattr(self, name) for name in self.shapes}
 
     @property
     def movable(self) -> bool:
-        """Whether :meth:`to` can move the group to another device: False if it holds functions of a plugin."""
+        """Whether :meth:`to` can move the group to another device; False if it holds a function instead of tensors."""
         return bool(self.shapes)
 
     def to(self, device: torch.device) -> Self:
@@ -139,9 +146,9 @@ class PrimitiveTensors:
         return replace(self, **{name: getattr(self, name).to(device) for name in self.shapes})  # type: ignore[type-var]
 
     def fault(self, sizes: Sizes) -> str | None:
-        """Return the first error in the tensors, ``"w2 has shape (5,); expected (100, 3), as means has N=100 ..."``.
+        """Return an error text for the first invalid tensor, ``"w2 has shape (5,); expected (100, 3), ..."``.
 
-        Returns None if all tensors are valid. ``sizes`` holds known sizes; the sizes found are added to it.
+        Returns None if all are valid. ``sizes`` maps the letters in shapes to known sizes; the sizes found are added.
         """
         return primitive_tensors_fault(
             [(name, getattr(self, name), shapes) for name, shapes in self.shapes.items()], sizes

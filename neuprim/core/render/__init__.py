@@ -97,7 +97,7 @@ def render(
 
 
 def _frame_recorder(model: Primitives, camera: AnyCamera, settings: RenderSettings) -> FrameRecorder | None:
-    """Return the recorder that replays frames of this model as CUDA graphs; None if they cannot be recorded."""
+    """Return the recorder that replays this model's frames as CUDA graphs; None if the frames cannot be recorded."""
     if model.device.type != device.CUDA or torch.is_grad_enabled():
         return None
     if [backend.name for backend in candidate_backends(settings, device.CUDA)][:1] != ["cuda"]:
@@ -110,7 +110,10 @@ def _frame_recorder(model: Primitives, camera: AnyCamera, settings: RenderSettin
 def render_lowered(
     lowered: LoweredPrimitives, camera: AnyCamera, settings: RenderSettings, background: Tensor | None = None
 ) -> RenderOutput:
-    """Render a model that :meth:`Primitives.lower` evaluated at its conditions; errors as :func:`render`."""
+    """Render primitives whose density and colour :meth:`Primitives.lower` evaluated for one frame.
+
+    Raises the same errors as :func:`render`.
+    """
     lowered.check(camera.viewmat, background)
     return _render_checked_view(lowered, camera, settings, background)
 
@@ -144,7 +147,7 @@ def _render_checked_view(
 
 
 def probe_backend(name: str) -> str | None:
-    """Test a backend by rendering one small sphere; return None if the backend works here, else the reason."""
+    """Test a backend by rendering one small sphere; return None if the image is right, else what went wrong."""
     from neuprim.core.model.geometry import Geometry
 
     try:
@@ -169,13 +172,13 @@ def probe_backend(name: str) -> str | None:
 def render_slabs(
     geometry: Geometry, density: LoweredDensity, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
-    """Render each group of primitives (slab) alone; return (S, H, W) opacities and (S, H, W) mean depths; no gradients.
+    """Render each slab (a group of primitives) alone; return (S, H, W) opacities and mean depths, without gradients.
 
     S is the number of slabs that have primitives. Slabs without primitives are left out; the others keep their order.
 
     Args:
         slabs: (N,) index of the slab of each primitive, 0 to ``count`` - 1, on the primitives' device.
-        settings: render settings with ``depth``.
+        settings: render settings; ``depth`` must be on.
     """
     with torch.no_grad():
         black = Constant(torch.zeros(geometry.count, 1, device=geometry.means.device))

@@ -44,16 +44,18 @@ class Backend:
     name: str  # value of the setting renderer.backend
     load: Callable[[], Draw]  # imports the backend and returns its render function
     unsupported: Callable[[LoweredPrimitives, AnyCamera | None], str | None] = _no_backend_fault
-    """Returns what the backend cannot render of a model with a camera (None: any pinhole), as the rest of a sentence
-    that starts with "cannot draw"; None if it can render all."""
+    """Function of a model and a camera (None: any pinhole) that returns what the backend cannot render, as the rest of
+    a sentence that starts with "cannot draw"; None if it can render all."""
     device_name: Callable[[], str] = _cpu_backend_name  # name of its device, for reports
     missing: Callable[[], str | None] = _no_backend_fault
-    """Returns what this machine lacks, such as a package; None if nothing. Must be fast."""
+    """Function that returns what this machine lacks for the backend, such as a package; None if nothing. Must be
+    fast."""
     checks: bool = False  # whether it checks that numbers are finite
     differentiates_intrinsics: bool = False  # whether focal lengths and principal points get gradients
     devices: tuple[str, ...] = (hardware.CPU,)  # kinds of device that it renders on, its main one first
     slabs: Callable[[], Callable[..., tuple[Tensor, Tensor]] | None] = _no_backend_fault
-    """Loads and returns the backend's function that renders all slabs in one frame; None if there is none."""
+    """Loads and returns the backend's function that renders all slabs (groups of primitives) in one frame; None if
+    there is none."""
 
     def drawing_device(self, settings: RenderSettings) -> str:
         """Return the kind of device, "cpu" or "cuda", on which the backend renders with these settings."""
@@ -133,7 +135,7 @@ TABLE: tuple[Backend, ...] = (
     ),
     Backend(REFERENCE, _backend_loader("reference"), differentiates_intrinsics=True),
 )
-"""Fastest first."""
+"""All backends, fastest first."""
 
 
 def backend_names() -> tuple[str, ...]:
@@ -215,7 +217,10 @@ def check_render_backend(settings: RenderSettings) -> None:
 
 
 def with_available_render_backend(settings: RenderSettings) -> RenderSettings:
-    """Return settings for a finished run: if no GPU works and the backend is "auto", device "cuda" becomes "auto"."""
+    """Return the settings of a finished run such that this machine can render it again, even without a GPU.
+
+    If no GPU works and the backend is "auto", the device "cuda" becomes "auto".
+    """
     gone = settings.device == hardware.CUDA and gpu_backends_unavailable() is not None and settings.backend == AUTO
     return replace(settings, device="auto") if gone else settings
 

@@ -1,4 +1,4 @@
-"""Layers, such as depth, that ``neuprim render --format exr`` can write, and the input of their functions.
+"""Image layers, such as depth, that ``neuprim render --format exr`` can write, and the view they are computed from.
 
 Every task has the layers in :data:`COMMON`; :attr:`neuprim.core.task.TaskSpec.layers` adds others.
 """
@@ -57,14 +57,14 @@ class LayerFrame:
 
     @cached_property
     def unshaded(self) -> Tensor:
-        """Image over black without :meth:`~neuprim.core.model.fields.ColourField.shade`, (H, W, C)."""
+        """Image over black, (H, W, C), without the shading (such as shadows) that the model's colour field computes."""
         with torch.no_grad():
             forms = self.model.lower(self.camera, self.conditions, shaded=False)
         return self._render(replace(self.lowered, colour=forms.colour, shade=None), self.settings).rgb
 
     @cached_property
     def shading(self) -> Tensor | None:
-        """Mean shading factor in each pixel, (H, W), 0 where the ray hits nothing; None if there is no shading."""
+        """Mean shading factor (1: no shadow) in each pixel, (H, W), 0 where the ray hits nothing; None if unshaded."""
         geometry, density = self.lowered.geometry, self.lowered.density
         with torch.no_grad():
             found = self.model.colour.shade(geometry, density, self.conditions, self.settings)
@@ -83,7 +83,10 @@ class LayerFrame:
         return torch.where(self.drawn.alpha > 0, factor, 0.0)
 
     def composite(self, colour: LoweredColour) -> Tensor:
-        """Return the (H, W, C') image over black, sum of alpha_i T_i c_i, with ``colour`` instead of the model's."""
+        """Return the (H, W, C') image over black, sum of alpha_i T_i c_i, where ``colour`` gives the colours c_i.
+
+        alpha_i is the opacity of primitive i on the ray, T_i the transmittance in front of it.
+        """
         return self._render(replace(self.lowered, colour=colour, shade=None), self.settings).rgb
 
     def integral(self, weights: Tensor | None = None) -> Tensor:
@@ -110,7 +113,10 @@ class LayerFrame:
         return found if n == 1 else found.reshape(self.camera.height, n, self.camera.width, n).mean((1, 3))
 
     def _thin(self, transmittance: Callable[[float], Tensor]) -> Tensor:
-        """Return -log of ``transmittance(1)``. For opaque pixels, compute it at lower densities and scale it up."""
+        """Return the optical depth -log of ``transmittance(1)``; ``transmittance(x)`` renders x times the density.
+
+        For opaque pixels, compute it at lower densities and scale it up.
+        """
         T = transmittance(1.0)
         found, opaque, factor = _depth_of_transmittance(T), T <= _CLEAR, 1.0
         for _ in range(_ROUNDS):
@@ -122,7 +128,10 @@ class LayerFrame:
         return found.clamp_min(0.0).add(0.0).to(T.dtype)  # no -0
 
     def _transmittance(self, weights: Tensor, camera: Camera, settings: RenderSettings) -> Tensor:
-        """Return the (H, W) transmittance with densities times ``weights``: renders black primitives over white."""
+        """Return the (H, W) transmittance of the primitives, each with its density multiplied by its weight, (N,).
+
+        Renders black primitives over a white background.
+        """
         lowered, means = self.lowered, self.lowered.geometry.means
         black = Constant(torch.zeros(len(means), 1, device=means.device))
         thin = replace(lowered, density=lowered.density.scaled(weights), colour=black, shade=None)
@@ -135,7 +144,7 @@ class LayerFrame:
 
 
 def _depth_of_transmittance(transmittance: Tensor) -> Tensor:
-    """Return the float64 optical depth -log T; T is at least the smallest normal number of its dtype."""
+    """Return the float64 optical depth -log T; T counts as at least the smallest normal number of its dtype."""
     return -transmittance.clamp_min(torch.finfo(transmittance.dtype).tiny).double().log()
 
 
@@ -151,8 +160,9 @@ class LayerSpec:
         summary: one line with meaning and unit of the values; it is also written into the file.
         draw: function of a :class:`LayerFrame` that returns (H, W, C) finite values, or (H, W) for one channel; or None
             if the model of the frame has no such layer.
-        channels: names of the channels. Empty for a layer of light: it has the channels of the task's images, over
-            black and premultiplied by alpha, is summed over the lights of an environment, and needs linear colours.
+        channels: names of the channels; empty for a layer of light. A layer of light has the channels of the task's
+            images, over black and premultiplied by alpha. It is summed over the lights of an environment and needs
+            linear colours.
     """
 
     name: str
@@ -167,7 +177,7 @@ class LayerSpec:
 
 
 LIGHTS = "lights"
-"""The name for all layers of single lights, ``light_000`` and so on, if several are on."""
+"""Name with which ``--layers`` selects the layers of all single lights, ``light_000`` and so on, if several are on."""
 
 COMMON: tuple[LayerSpec, ...] = (
     LayerSpec("beauty", "the image, linear light, premultiplied by alpha", lambda frame: frame.drawn.rgb),

@@ -1,9 +1,9 @@
-"""Column numbers of the arrays that CPU and CUDA kernels share, and numerical bounds of their per-primitive stage.
+"""Column numbers of the arrays of CPU and CUDA kernels, and bounds above which a primitive is drawn in float64.
 
-A pixel kernel reads one float32 row per primitive. The backward pass writes one row of gradients (a gradient row) per
-(tile, primitive) pair. Constant offsets into flat arrays let LLVM vectorise. The CUDA kernels have float4 rows
-(:mod:`neuprim.core.render.cuda.layout`), but float64 rows and gradient rows with these columns. benchmarks/numerics.py
-gave the float32 bounds.
+A pixel kernel reads one float32 row of numbers per primitive (ellipsoid). The backward pass writes one row of gradients
+(a gradient row) per (tile, primitive) pair; a tile has 16 x 16 pixels. Column numbers are constants, so that LLVM can
+vectorise. The CUDA kernels pack float32 rows in float4 columns (:mod:`neuprim.core.render.cuda.layout`). Their float64
+rows and gradient rows have the columns below. The float32 bounds were measured with benchmarks/numerics.py.
 """
 
 from __future__ import annotations
@@ -73,5 +73,5 @@ MIN_RIM_SHARES = tuple(MIN_RIM ** (p + 0.5) for p in EDGES)  # share of the larg
 
 
 def min_visible_depth(alpha_min: float) -> float:
-    """Return the optical depth from which a sample is drawn: that of opacity ``alpha_min``, less a rounding margin."""
+    """Return the optical depth below which samples (ray x primitive) are skipped: that of ``alpha_min``, less 1 %."""
     return -float(np.log1p(-alpha_min)) * VISIBLE_SHARE

@@ -23,7 +23,8 @@ from neuprim.core.render.layer_frame import LayerFrame, LayerSpec
 from neuprim.core.settings import RenderSettings
 
 VISIBILITY = ("none", "primitive", "pixel")
-"""Where the light's visibility is computed: nowhere, at the primitives' centres, or at the mean depth of each pixel."""
+"""Where the light's visibility (1: lit, 0: in shadow) is computed: nowhere, at the primitives' centres, or at the mean
+depth of each pixel."""
 
 # ---------------------------------------------------------------- directions
 
@@ -43,7 +44,7 @@ def check_typical_light(typical: float) -> None:
 
 
 def light_factor(geometry: Geometry, conditions: Conditions, typical: float, falloff: bool) -> Tensor:
-    """Return the (N, C) light intensity at primitives, divided by ``typical``.
+    """Return the (N, C) light intensity at N primitives, divided by the intensity ``typical``.
 
     With ``falloff``, it is also divided by the squared distance from the light to the primitive's centre.
     """
@@ -62,10 +63,10 @@ LAYERS = 4  # slabs of equal depth; more of them separate depths better and take
 VOLUME_SIZE, VOLUME_LAYERS = 64, 16  # for smoke, which is smooth and shadows itself at every depth
 
 FADE, EXTENTS, PIXEL_FADE = 1 / 50, 1.5, 1 / 10
-"""The distance behind a depth image over which light fades. At a primitive: FADE scene diameters, as the light sees
-the scene, plus EXTENTS times its own extent towards the light. At a pixel: PIXEL_FADE diameters. Surfaces made of
-ellipsoids are bumpy: if light fades faster, the bumps shadow each other; if slower, shadows detach from their casters.
-A point on a depth image itself keeps all of its light."""
+"""Distances over which light fades behind a depth image of a shadow map. At a primitive, the distance is FADE scene
+diameters plus EXTENTS times the primitive's own extent towards the light. At a pixel, it is PIXEL_FADE scene diameters.
+Surfaces made of ellipsoids are bumpy: if light fades faster, the bumps shadow each other; if slower, shadows detach
+from their casters. A point on a depth image itself keeps all of its light."""
 
 _FAR = 1e3  # scene radii; beyond, all rays are parallel, and float32 depths lose all digits
 _CHUNK = 1024  # points per unit of work
@@ -74,7 +75,10 @@ _CHUNK = 1024  # points per unit of work
 def shade_by_light(
     where: str, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
 ) -> Shading | None:
-    """Return the visibility of the frame's light, computed as ``where`` (:data:`VISIBILITY`) says; None for "none"."""
+    """Return the visibility of the light, a factor on colours; None if ``where`` (:data:`VISIBILITY`) is "none".
+
+    With "primitive", visibility is computed at the primitives' centres; with "pixel", at the mean depth of each pixel.
+    """
     if where == "none":
         return None
     light = conditions["light"]
@@ -87,9 +91,9 @@ def shade_by_light(
 def shade_volume_by_light(
     geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
 ) -> Shading:
-    """Return the visibility of the frame's light at the primitives' centres, for overlapping primitives as in smoke.
+    """Return the visibility of the light at the primitives' centres, for overlapping primitives as in smoke.
 
-    Each slab absorbs evenly over its own depth.
+    The light crosses slabs (ranges of depth from the light), and each absorbs gradually over about its own depth.
     """
     visible = light_visibility(geometry, density, conditions["light"], settings, VOLUME_SIZE, VOLUME_LAYERS)
     return Shading(primitives=visible(geometry.means, 1 / VOLUME_LAYERS, before=0.5))
@@ -112,8 +116,8 @@ def extents_towards(geometry: Geometry, point: Tensor) -> Tensor:
 class Visibility(Protocol):
     """Function of scene points (M, 3) that returns (M,) float32 visibility of a light, 0 to 1.
 
-    At a slab, light fades over ``fade`` scene diameters plus (M,) ``more`` scene units. The fraction ``before`` of this
-    distance lies before the slab's mean depth, the rest behind.
+    At a slab (primitives at similar depth from the light), light fades over ``fade`` scene diameters plus (M,) ``more``
+    scene units. The fraction ``before`` of this distance lies before the slab's mean depth, the rest behind.
     """
 
     def __call__(self, points: Tensor, fade: float, more: Tensor | None = None, before: float = 0.0) -> Tensor: ...
@@ -129,8 +133,8 @@ def light_visibility(
 ) -> Visibility:
     """Return the function that gives the visibility of a point light (3,), computed by layered shadow maps.
 
-    The primitives are sorted into slabs by depth from the light. Each slab is rendered alone, to opacity A_k and mean
-    depth d_k. The light's transmittance at a point x of depth z is
+    The primitives are sorted into ``layers`` slabs by depth from the light. Each slab is rendered alone, as an image of
+    ``size`` x ``size`` pixels with opacity A_k and mean depth d_k. The light's transmittance at a point x of depth z is
 
         V(x) = prod_k (1 - A_k s((z - d_k)/fade)),      s a smooth step from 0 at 0 to 1 at 1,
 
@@ -140,8 +144,8 @@ def light_visibility(
     itself at grazing light. V carries no gradient.
 
     The light's camera looks at the middle of all centres and sees all of them. A light among the primitives also looks
-    at that middle; points behind the light count as lit. ``settings`` are the frame's own: its backend and threads also
-    draw the depth images.
+    at that middle; points behind the light count as lit. The depth images are rendered with the backend and threads of
+    the frame's ``settings``.
     """
     if not geometry.count:
         return lambda points, fade, more=None, before=0.0: torch.ones(len(points), device=points.device)
@@ -199,7 +203,11 @@ def sample_visibility(
     fades: Tensor,
     before: float = 0.0,
 ) -> Tensor:
-    """Return (M,) float32 visibility of ``points`` (M, 3) float64, in torch; the GPU version of the kernel below."""
+    """Return the (M,) float32 visibility of a light at ``points`` (M, 3) float64; the torch version, for GPUs.
+
+    ``alphas`` and ``depths`` (slabs, S, S) are the images of the shadow maps, ``view`` the (3, 4) matrix from scene to
+    light, and ``fades`` (M,) the distances over which light fades behind a slab.
+    """
     nearness = torch.where(alphas > 0, alphas.double() / depths.double().clamp_min(near), 0.0)
     images = torch.stack([alphas.double(), nearness], 1)  # (slabs, 2, S, S)
     x, y, z = ((view[a, :3] * points).sum(-1) + view[a, 3] for a in range(3))
@@ -216,7 +224,7 @@ def sample_visibility(
 
 @exact_kernel
 def _visibility_kernel(start, stop, points, view, near, focal, alphas, depths, nearest, fades, before, found):  # type: ignore[no-untyped-def]
-    """Write the visibility of points start:stop into ``found``, as :func:`sample_visibility` computes it."""
+    """Write the visibility of a light at points ``start:stop`` into ``found``; see :func:`sample_visibility`."""
     size = alphas.shape[1]
     for p in range(start, stop):
         x = view[0, 0] * points[p, 0] + view[0, 1] * points[p, 1] + view[0, 2] * points[p, 2] + view[0, 3]

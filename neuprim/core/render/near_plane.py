@@ -58,7 +58,7 @@ def typical_pixel_size(means: Tensor, cameras: Sequence[AnyCamera], extent: floa
 
 
 def resolve_near(settings: RenderSettings, means: Tensor, cameras: Sequence[AnyCamera]) -> RenderSettings:
-    """Return the settings with a number instead of ``near="auto"``, from points (N, 3) and the cameras."""
+    """Return the settings with ``near="auto"`` replaced by a distance, chosen from the depths of points (N, 3)."""
     if settings.near != "auto":
         return settings
     if not len(means):

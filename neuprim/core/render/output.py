@@ -19,14 +19,17 @@ from neuprim.core.settings import RenderSettings
 
 @dataclass
 class Contributions:
-    """Contribution of each of N primitives to the image of a frame; 0 until the backward pass fills the values."""
+    """How much each of N primitives contributes to the image of a frame; 0 until the backward pass fills the values."""
 
     weight: Tensor  # (N,) sum over pixels of alpha_i T_i; positive exactly for visible primitives
     error_weight: Tensor  # (N,) sum over pixels of alpha_i T_i x error
     rows: Tensor | None = None  # (N,) rows of the model, if some primitives were left out of the frame
 
     def of_all(self, count: int) -> tuple[Tensor, Tensor]:
-        """Return ``weight`` and ``error_weight``, (count,) each, of all the model's primitives; 0 outside the frame."""
+        """Return ``weight`` and ``error_weight``, each (count,), for all ``count`` primitives of the model.
+
+        Primitives that were left out of the frame get 0.
+        """
         if self.rows is None:
             return self.weight, self.error_weight
         weight, error_weight = (
@@ -36,7 +39,7 @@ class Contributions:
 
 
 def sum_contributions(frames: Sequence[Contributions], count: int) -> Contributions:
-    """Sum the contributions to several frames, in their order, for all ``count`` primitives of the model."""
+    """Return the sums of each primitive's contributions over several frames, for all ``count`` primitives."""
     weight, error = frames[0].of_all(count)
     for contributions in frames[1:]:
         more = contributions.of_all(count)
@@ -46,7 +49,7 @@ def sum_contributions(frames: Sequence[Contributions], count: int) -> Contributi
 
 @dataclass
 class ContributionRequest:
-    """A request for contributions. The backward pass of a backend reads ``error`` and fills ``result``."""
+    """A request to measure contributions. The backward pass of a backend reads ``error`` and fills ``result``."""
 
     error: Tensor  # error of each ray, in the shape of the frame as the backend drew it
     result: Contributions
@@ -54,7 +57,7 @@ class ContributionRequest:
     sums: tuple[Tensor, Tensor] | None = None
 
     def add(self, rows: Tensor, weight: Tensor, error_weight: Tensor) -> None:
-        """Add (R,) sums over some of the rays for primitives ``rows`` (R,); for backends that render in blocks."""
+        """Add (R,) sums over one block of rays for primitives ``rows`` (R,), for backends that render in blocks."""
         if self.sums is None:
             blank = torch.zeros_like(self.result.weight, device=rows.device)
             self.sums = blank, blank.clone()
@@ -63,7 +66,7 @@ class ContributionRequest:
         self.fill(*self.sums)
 
     def fill(self, weight: Tensor, error_weight: Tensor) -> None:
-        """Set the result from (N,) sums over all rays, one per primitive."""
+        """Set ``result`` from (N,) sums over all rays, one per primitive, divided by the number of rays per pixel."""
         n = self.rays
         weight, error_weight = (sums.to(self.result.weight.device) for sums in (weight, error_weight))
         self.result.weight, self.result.error_weight = (
@@ -121,7 +124,10 @@ class RenderOutput:
 
 
 def mean_depth(weighted: Tensor, alpha: Tensor) -> Tensor:
-    """Return the (H, W) mean depth: sum of w z (``weighted``) over sum of w (``alpha``); 0 where nothing is hit."""
+    """Return the (H, W) mean depth, ``weighted`` / ``alpha``; 0 where ``alpha`` is 0.
+
+    ``weighted`` is the sum of weight times depth over the primitives on each ray, ``alpha`` the sum of the weights.
+    """
     hit = alpha > 0
     if not (torch.is_grad_enabled() and (weighted.requires_grad or alpha.requires_grad)):
         return (weighted / alpha).masked_fill_(~hit, 0.0)
@@ -129,7 +135,8 @@ def mean_depth(weighted: Tensor, alpha: Tensor) -> Tensor:
 
 
 Draw = Callable[..., RenderOutput]
-"""Type of a backend's ``render(lowered, camera, background, settings)``; the supported cameras differ."""
+"""Type of a backend's function ``render(lowered, camera, background, settings)``. Backends support different
+cameras."""
 
 
 def draw_pixel_samples(
@@ -145,7 +152,7 @@ def draw_pixel_samples(
 
 
 def _average_pixel_samples(image: Tensor, n: int) -> Tensor:
-    """Return the means over n x n pixels of an (n H, n W) or (n H, n W, C) image."""
+    """Return the (H, W) or (H, W, C) image of means over blocks of n x n pixels of an image n times as large."""
     h, w = image.shape[0] // n, image.shape[1] // n
     return image.reshape(h, n, w, n, *image.shape[2:]).mean((1, 3))
 
@@ -164,7 +171,10 @@ def unproject_rendered_depth(depth: Tensor, camera: AnyCamera) -> Tensor:
 
 
 def draw_shaded_view(draw: Draw) -> Draw:
-    """Return a draw function that multiplies the image over black by ``lowered.shade`` at the mean depth."""
+    """Return a draw function that shades the image of ``draw`` pixel by pixel, for example with shadows.
+
+    It multiplies the image over black by ``lowered.shade``, evaluated at the scene point of each pixel's mean depth.
+    """
 
     def shaded(
         lowered: LoweredPrimitives, camera: AnyCamera, background: Tensor | None, settings: RenderSettings

@@ -1,7 +1,7 @@
-"""Render a model with the :class:`torch.autograd.Function` of the cpu or cuda backend: inputs, outputs, gradients.
+"""Shared code of the cpu and cuda backends: call a backend's :class:`torch.autograd.Function` and return its gradients.
 
-``forward`` takes ``(ctx, request, viewmat, background, palette, *tensors)``; ``tensors`` are those that
-:data:`PARAMETERS` names, then those of NET.
+The function's ``forward`` takes ``(ctx, request, viewmat, background, palette, *tensors)``. ``palette`` has the (N, C)
+colours. ``tensors`` are the tensors named in :data:`PARAMETERS` and, for colour networks, those named in ``NET``.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.settings import RenderSettings
 
 PARAMETERS = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")
-"""Inputs of the per-primitive stage, in the order in which its kernels take them."""
+"""Names of the tensors of geometry and density, in the order in which the kernels take them."""
 
 NET = ("Wx", "bias", "Wout")
 
 
 @dataclass(frozen=True)
 class RasterRequest:
-    """The inputs of a kernel backend that are not tensors, for one frame."""
+    """All inputs of one frame for the cpu or cuda backend that are not tensors."""
 
     camera: Camera
     turns: float  # omega0 / 2 pi of the density
@@ -64,7 +64,11 @@ def rasterize(
     settings: RenderSettings,
     capacity: Any = None,
 ) -> RenderOutput:
-    """Render :class:`Cosine` densities with :class:`Constant` or :class:`RayNet` colours by ``operation``."""
+    """Render a model with a backend's autograd function ``operation``; return the image, alpha and optional depth.
+
+    The density must be :class:`Cosine`, the colour :class:`Constant` or :class:`RayNet`. ``name`` is the backend's
+    name.
+    """
     colour = lowered.colour
     net: tuple[Tensor, ...] = ()
     assert isinstance(colour, Constant | RayNet), "the caller chooses a backend that knows the forms"
@@ -85,15 +89,19 @@ def rasterize(
 
 
 def remember_rasterizer_inputs(ctx: Any, inputs: Sequence[Tensor]) -> None:
-    """Save the inputs' dtypes and devices for :func:`rasterizer_input_gradients`; leave unused gradients None."""
+    """Save device and dtype of each input in ``ctx``, for :func:`rasterizer_input_gradients`.
+
+    Also make autograd pass None instead of zeros for outputs that have no gradient.
+    """
     ctx.inputs_like = [(x.device, x.dtype) for x in inputs]
     ctx.set_materialize_grads(False)  # without a gradient, the depth image adds no cost
 
 
 def rasterizer_input_gradients(ctx: Any, view: Tensor | None, gradients: Sequence[Tensor | None]) -> tuple[Any, ...]:
-    """Return what ``backward`` must return: a gradient per input, in its dtype and on its device.
+    """Return the tuple that ``backward`` must return: one gradient per input, with the input's dtype and device.
 
-    ``view`` is the (3, 4) dL/d(R | t), and ``gradients`` are those of the inputs that follow ``viewmat``.
+    ``view`` is the (3, 4) gradient of the camera's rotation and translation (R | t). ``gradients`` has one gradient for
+    each input after ``viewmat``.
     """
     full = None
     if view is not None:

@@ -24,7 +24,7 @@ _BLOCK = 32  # pixels per side of a block; limits memory, does not change result
 
 
 class _FlooredSqrt(torch.autograd.Function):
-    """sqrt(D) with its derivative taken at max(D, floor), because the derivative grows as D^-1/2 at a silhouette."""
+    """sqrt(D) with the derivative taken at max(D, floor), because it grows as D^-1/2 at a silhouette, where D = 0."""
 
     @staticmethod
     def forward(ctx: Any, D: Tensor, floor: float) -> Tensor:
@@ -39,7 +39,7 @@ class _FlooredSqrt(torch.autograd.Function):
 
 
 class _Contributions(torch.autograd.Function):
-    """Identity on the weights of a block; its backward pass sums the contributions of each primitive."""
+    """Identity on the compositing weights of a block of rays; its backward pass sums each primitive's contributions."""
 
     @staticmethod
     def forward(ctx: Any, weights: Tensor, rows: Tensor, pixels: Tensor, stats: RenderStats) -> Tensor:
@@ -58,7 +58,7 @@ class _Contributions(torch.autograd.Function):
 
 
 class _PreparedPrimitives:
-    """Primitives of one view, in float64 and camera axes."""
+    """Geometry of all primitives of one view, in float64: centres and axes in camera coordinates."""
 
     def __init__(self, lowered: LoweredPrimitives, camera: AnyCamera) -> None:
         g = lowered.geometry
@@ -122,9 +122,9 @@ def _composite_ray_block(
     settings: RenderSettings,
     stats: RenderStats,
 ) -> Tensor:
-    """Composite P rays through primitives ``rows``, sorted front to back; return (P, channels + 2).
+    """Composite P rays through the primitives ``rows``, sorted front to back; return (P, channels + 2).
 
-    The columns are premultiplied colour, transmittance and the sum of w z.
+    The columns are premultiplied colour, transmittance and the sum of weight times depth.
     """
     d, P = rays.directions, len(pixels)
     with torch.no_grad():  # find the (primitive, ray) pairs that intersect
@@ -221,10 +221,10 @@ class FrameRays(ABC):
 
     @abstractmethod
     def touched(self, y: int, x: int, h: int, w: int) -> Tensor:
-        """Return (N,) bool: False only if no ray of the h x w pixels at (y, x) hits the primitive."""
+        """Return (N,) bool; False only if no ray of the h x w pixels from corner (y, x) hits the primitive."""
 
     def block(self, y: int, x: int, h: int, w: int) -> tuple[ReferenceRays, Tensor]:
-        """Return the h*w rays of the pixels at (y, x), and the primitives that they may hit, front to back."""
+        """Return the rays of the h x w pixels from corner (y, x), and primitives that they may hit, front to back."""
         window, r = (slice(y, y + h), slice(x, x + w)), self.rays
         rays = ReferenceRays(
             r.directions[window].reshape(-1, 3), r.near[window].reshape(-1), r.depth[window].reshape(-1)
@@ -242,7 +242,7 @@ def pixel_ray_directions(camera: Camera) -> Tensor:
 
 
 class _PinholeRays(FrameRays):
-    """Rays of a pinhole camera: near, depth and order are in camera-z; culling by exact screen boxes."""
+    """Rays of a pinhole camera; near plane, depth and order are in camera-z; culling is by exact screen boxes."""
 
     def __init__(self, camera: Camera, geometry: Geometry, center: Tensor, near: float) -> None:
         d = pixel_ray_directions(camera)
@@ -257,7 +257,7 @@ class _PinholeRays(FrameRays):
 
 
 class _CentralRays(FrameRays):
-    """Rays of a RayCamera: near, depth and order are distances from it; culling by a cone around each block's rays."""
+    """Rays of a RayCamera; near plane, depth and order are distances; culling is by a cone around each block's rays."""
 
     def __init__(self, camera: RayCamera, geometry: Geometry, center: Tensor, near: float) -> None:
         d = camera.directions.double()
@@ -284,9 +284,10 @@ class _CentralRays(FrameRays):
 
 
 def frame_rays(camera: AnyCamera, geometry: Geometry, center: Tensor, near: float) -> FrameRays:
-    """Return the rays of a camera, which also tell the primitives that they may meet, front to back.
+    """Return the rays of all pixels of a camera, and the order of the primitives along them.
 
-    The order follows from ``center``, the (N, 3) float64 centres of the primitives in camera coordinates.
+    The order, front to back, follows from ``center``, the (N, 3) float64 centres of the primitives in camera
+    coordinates.
     """
     make = _CentralRays if isinstance(camera, RayCamera) else _PinholeRays
     return make(camera, geometry, center, near)  # type: ignore[arg-type]
@@ -295,9 +296,10 @@ def frame_rays(camera: AnyCamera, geometry: Geometry, center: Tensor, near: floa
 def screen_boxes(geometry: Geometry, camera: Camera, near: float) -> Tensor:
     """Return the (N, 4) float64 pixel bounds (x0, y0, x1, y1) of each ellipsoid's projection.
 
-    In the plane of image axis i and the optical axis, the tangents are x_i/z = (k +- sqrt(D))/(z^2 - S_zz) with
-    k = c_i z - S_iz, D = z^2 S_ii - 2 c_i z S_iz + c_i^2 S_zz - (S_ii S_zz - S_iz^2), S = B diag(s^2) B^T and centre c.
-    An ellipsoid cut by the near plane gets the whole screen, an ellipsoid behind it an empty box (x1 < x0).
+    In the plane of image axis i and the optical axis z, the tangents are x_i/z = (k +- sqrt(D))/(z^2 - S_zz) with k =
+    c_i z - S_iz, D = z^2 S_ii - 2 c_i z S_iz + c_i^2 S_zz - (S_ii S_zz - S_iz^2), S = B diag(s^2) B^T. In camera axes,
+    c is the ellipsoid's centre (depth z) and B its orientation; s are its semi-axes. An ellipsoid cut by the near plane
+    gets the whole screen, an ellipsoid behind it an empty box (x1 < x0).
     """
     view = camera.viewmat.detach().double()
     R = view[:3, :3]

@@ -1,8 +1,8 @@
 """A trainer for training one model on several ranks (processes), each of which holds the whole model.
 
-Every rank draws all random numbers of a step, renders its own views, and receives the sum of the gradients of all
-views, added in a fixed order. All ranks then make the same update, population control included. R ranks with V views
-per step give the same bits as one process with R x V views per step.
+Every rank draws the same random numbers for all views of a step, but renders only its own views. It receives the sum of
+the gradients of all views, added in a fixed order. All ranks then make the same update, population control included. R
+ranks with V views per step give the same bits as one process with R x V views per step.
 """
 
 from __future__ import annotations
@@ -28,17 +28,19 @@ from neuprim.core.train.trainer import Trainer
 from neuprim.core.train.training_views import hash_training_views
 
 _ALIGNMENT = 16
-"""Alignment in float32 numbers: tensors start at multiples of 64 bytes, which vector units read at once."""
+"""Alignment of the tensors in an exchange buffer, in float32 numbers. 16 numbers are 64 bytes, which vector units read
+at once."""
 
 
 class _RankMessage(NamedTuple):
     """Message that a rank sends to all other ranks in each step.
 
     Attributes:
-        checksum: checksum of the positions before the step; a difference reveals a rank that computes differently.
+        checksum: checksum of the primitives' positions before the step; a difference reveals a rank that computes
+            differently.
         elapsed: seconds of training; all ranks use the value of rank 0.
         stop: whether this rank was asked to stop.
-        present: for each parameter, whether it has a gradient.
+        present: for each parameter, whether it has a gradient on this rank.
         views: results of the rank's views, in order.
     """
 
@@ -50,13 +52,13 @@ class _RankMessage(NamedTuple):
 
 
 class DistributedTrainer(Trainer):
-    """Trainer of one rank; every rank renders ``train.views_per_step`` views per step.
+    """Trainer of one rank (process); every rank renders ``train.views_per_step`` views per step.
 
     Args:
         group: connection to the other ranks.
 
-        Raises:
-            ConfigError: as Trainer, and for training without views, which cannot be divided among ranks.
+    Raises:
+        ConfigError: as Trainer, and for ``train.supervision=voxels``, which uses no views to divide among ranks.
     """
 
     def __init__(
@@ -106,7 +108,7 @@ class DistributedTrainer(Trainer):
         """Take one training step with the other ranks, as :meth:`~neuprim.core.train.trainer.Trainer.train_step`.
 
         Raises:
-            RankError: another rank ended or computes differently. This trainer's state is that before the step.
+            RankError: another rank ended or computes differently. This trainer then has the state from before the step.
         """
         order, generator = self.order, self.generator.get_state()
         try:
@@ -160,7 +162,7 @@ class DistributedTrainer(Trainer):
         return every, self._sums.finish(self.model.params, present)
 
     def _stop_clock(self, start: float) -> float:
-        """Return rank 0's training time at :meth:`_combine_views`; the rest of the step counts for the next step."""
+        """Return rank 0's training time in :meth:`_combine_views`; the rest of the step counts for the next step."""
         self._after = time.perf_counter() - self._agreed_at
         return self._agreed
 
@@ -173,9 +175,9 @@ class GradientSum:
     """Sum of gradients and contributions over the views of all ranks, in the order of the views.
 
     The order of additions in an all-reduce is not fixed, which changes the bits. Here every rank owns a slice of a flat
-    buffer. It receives this slice of every view, adds the views one after the other, as a single process does, and
-    sends the sum to the other ranks. This moves as many bytes as a ring all-reduce. The buffers are reused, because
-    allocating new memory pages takes as long as sending them.
+    buffer. The rank receives its slice from every view, and adds the views one after the other, as a single process
+    does. Then it sends the sum to the other ranks. This moves as many bytes as a ring all-reduce. The buffers are
+    reused, because allocating new memory pages takes as long as sending them.
     """
 
     def __init__(self, params: Mapping[str, Tensor], group: ProcessGroup) -> None:
@@ -195,11 +197,11 @@ class GradientSum:
         *self._gradients, self._weight, self._error = parts
 
     def fits(self, params: Mapping[str, Tensor]) -> bool:
-        """Return whether the buffers fit parameters of these shapes."""
+        """Return whether the buffers fit ``params``: the names and shapes must be those given to the constructor."""
         return self.shapes == {name: value.shape for name, value in params.items()}
 
     def add(self, params: Mapping[str, Tensor], contributions: Contributions) -> list[bool]:
-        """Add the gradients of one view of every rank, in the order of the ranks, and clear those of ``params``.
+        """Add gradients and contributions of one view of every rank, in rank order; clear ``.grad`` of ``params``.
 
         Returns, for each parameter, whether it had a gradient on this rank.
         """
@@ -224,7 +226,7 @@ class GradientSum:
         return present
 
     def finish(self, params: Mapping[str, Tensor], present: Sequence[bool]) -> Contributions:
-        """Set the summed gradients of the ``present`` parameters, and return the summed contributions.
+        """Set ``.grad`` of the ``present`` parameters to the sum over all views; return the summed contributions.
 
         Gradients and contributions are valid until the next :meth:`add`, which starts a new sum.
         """

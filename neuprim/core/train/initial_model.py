@@ -30,10 +30,10 @@ def initial_model_to_train(
 ) -> Primitives:
     """Return an untrained model on starting points; a primitive's size is the RMS distance to its 3 nearest points.
 
-    ``model.init.points``: "matter" (the points of the data set), "box" (random in the data set's box), or a .ply file
-    of points or 3D Gaussians in the coordinate system of the data files; Gaussians also set sizes, orientations and
-    opacities. ``model.init.scale`` multiplies all sizes. ``model.init.surroundings``, 0 by default: fraction of the
-    primitives placed where photographs show something and the data set has no points.
+    ``model.init.points`` chooses the points: "matter" (the points of the data set), "box" (random in the data set's
+    box), or a .ply file of points or 3D Gaussians in the coordinate system of the data files. Gaussians also set sizes,
+    orientations and opacities. ``model.init.scale`` multiplies all sizes. ``model.init.surroundings``, 0 by default, is
+    the fraction of the primitives placed where photographs show something and the data set has no points.
 
     Raises:
         ConfigError: a setting does not exist or has an invalid value.
@@ -88,7 +88,10 @@ def initial_model_to_train(
 def _add_initial_surroundings(
     cloud: PointCloud, dataset: Dataset, settings: ModelSettings, generator: torch.Generator
 ) -> PointCloud:
-    """Replace a fraction (``model.init.surroundings``) of the points by points on visible surfaces that have none."""
+    """Return ``cloud`` with some points replaced by points on visible surfaces that it does not cover.
+
+    The setting ``model.init.surroundings`` is the fraction to replace.
+    """
     share = settings.init.get("surroundings", 0.0)
     if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < 1:
         raise ConfigError(

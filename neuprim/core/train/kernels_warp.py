@@ -1,7 +1,7 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Warp kernels for training steps on a GPU: Adam in two launches a parameter, and L1 + SSIM with its gradient in four.
+"""Warp kernels for training steps on a GPU: Adam (two launches per parameter), and L1 + SSIM with its gradient (four).
 
-For the derivation of SSIM's gradient see :mod:`neuprim.core.train.ssim_cpu`. Warp is imported with this module.
+For the derivation of SSIM's gradient see :mod:`neuprim.core.train.ssim_cpu`. Importing this module imports Warp.
 """
 
 import functools
@@ -20,7 +20,7 @@ from neuprim.core.train.ssim_cpu import SSIM_TAPS, SSIM_WINDOW
 
 @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
 def check_adam_gradient(grad: Floats, refused: Ints):
-    """Set ``refused`` if a gradient is not finite; one thread per element of ``grad``."""
+    """Set the flag ``refused`` if a number of ``grad`` is NaN or infinite; one thread per number."""
     if not wp.isfinite(grad[wp.tid()]):
         refused[0] = 1  # whichever thread writes it
 
@@ -30,11 +30,11 @@ def take_adam_step(
     value: Floats, grad: Floats, first: Floats, second: Floats, width: int, rates: Floats, parameter: int,
     beta1: float, beta2: float, rest1: float, rest2: float, log1: float, log2: float, age: Longs, refused: Ints,
 ):  # fmt: skip
-    """Take an Adam step unless ``refused`` is set; one thread per number.
+    """Take an Adam step in place unless the flag ``refused`` is set; one thread per number of ``value``.
 
-    A row has ``width`` numbers; ``age`` counts its steps before this one. The learning rate is ``rates[parameter]``.
-    ``rest1`` and ``rest2`` are 1 - ``beta1`` and 1 - ``beta2``, rounded once; ``log1`` and ``log2`` are the logarithms
-    of the betas.
+    ``first`` and ``second`` are Adam's moments. A row (the numbers of one primitive) has ``width`` numbers; ``age``
+    counts its steps before this one. The learning rate is ``rates[parameter]``. ``rest1`` and ``rest2`` are 1 -
+    ``beta1`` and 1 - ``beta2``, rounded once; ``log1`` and ``log2`` are the logarithms of the betas.
     """
     i = wp.tid()
     if refused[0] == 0:
@@ -56,15 +56,15 @@ def adam_rows(
     values: Sequence[Tensor], grads: Sequence[Tensor], firsts: Sequence[Tensor], seconds: Sequence[Tensor],
     rates: Tensor, age: Tensor, betas: tuple[float, float], refused: Tensor,
 ) -> None:  # fmt: skip
-    """Take one Adam step in place, unless ``refused`` is set. If a gradient is not finite, only set ``refused``.
+    """Take one Adam step in place, unless the flag ``refused`` is set. If a gradient is not finite, only set the flag.
 
     Args:
         values, grads, firsts, seconds: lists of P float32 tensors (N, ...), none empty, contiguous except ``grads``.
             ``firsts`` and ``seconds`` are Adam's moments.
         rates: (P,) float32, the learning rates.
-        age: (N,) int64, steps of each row before this one; grows by 1.
+        age: (N,) int64, steps of each row (primitive) before this one; grows by 1.
         betas: decays of the first and of the second moment.
-        refused: (1,) int32.
+        refused: (1,) int32 flag.
     """
     device, flag = age.device, array(refused, wp.int32)
     flat = [tuple(array(x.contiguous().view(-1), wp.float32) for x in each) for each in zip(
@@ -91,7 +91,7 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
     def along_rows(
         a: wp.array3d(dtype=float), b: wp.array3d(dtype=float), window: _Window, out: wp.array3d(dtype=_vec5)
     ):
-        """Blur a, b, a^2, b^2 and ab of the images a and b along pixel rows, to (H, W - 10, C)."""
+        """Blur a, b, a^2, b^2 and ab of images a and b (H, W, C) horizontally, into ``out`` (H, W - 10, C)."""
         y, x, c = wp.tid()
         total = _vec5()
         for k in range(SSIM_TAPS):
@@ -109,7 +109,10 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
     def compare(
         rows: wp.array3d(dtype=_vec5), window: _Window, S: wp.array3d(dtype=float), maps: wp.array3d(dtype=wp.vec3)
     ):
-        """Compute SSIM of images a and b, (H - 10, W - 10, C), and its derivatives by window means of a, a^2 and ab."""
+        """Blur ``rows`` vertically and compute SSIM of the images a and b from it, into ``S`` (H - 10, W - 10, C).
+
+        ``maps`` gets the derivatives of SSIM with respect to the window means of a, a^2 and ab.
+        """
         y, x, c = wp.tid()
         total = _vec5()
         for k in range(SSIM_TAPS):
@@ -126,7 +129,7 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def back_along_columns(maps: wp.array3d(dtype=wp.vec3), window: _Window, out: wp.array3d(dtype=wp.vec3)):
-        """Apply the adjoint of the blur along columns, to (H, W - 10, C)."""
+        """Apply the adjoint of the vertical blur to ``maps`` (H - 10, W - 10, C), into ``out`` (H, W - 10, C)."""
         y, x, c = wp.tid()
         total = wp.vec3()
         for k in range(SSIM_TAPS):
@@ -141,9 +144,11 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
         by_l1: float, by_ssim: float,
         difference: wp.array3d(dtype=float), grad: wp.array3d(dtype=float),
     ):  # fmt: skip
-        """Write |a - b| and dloss/da, applying the adjoint of the blur along rows.
+        """Write |a - b| into ``difference``, and the gradient of the loss with respect to ``a`` into ``grad``.
 
-        ``by_l1`` is the weight of L1 over (pixels x channels), ``by_ssim`` that of SSIM over (windows x channels).
+        ``columns`` has the derivatives of SSIM after the adjoint of the vertical blur; the horizontal one is applied
+        here. ``by_l1`` is the weight of L1 over (pixels x channels), ``by_ssim`` that of SSIM over (windows x
+        channels).
         """
         y, x, c = wp.tid()
         total = wp.vec3()
@@ -168,7 +173,7 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
 def ssim_loss_with_gradient(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, Tensor]:
     """Return (mean absolute difference, mean SSIM) as (2,) float64, and the (H, W, C) gradient of the loss.
 
-    The loss is (1 - weight) L1 + weight (1 - SSIM).
+    The loss is (1 - weight) L1 + weight (1 - SSIM). The gradient is with respect to ``rendered``.
 
     Args:
         rendered, truth: (H, W, C) float32, at least 11 x 11 pixels, on the same device.

@@ -34,12 +34,13 @@ _DARK = 0.05
 _ROWS = 65_536  # primitives whose distances from all cameras are in memory at once
 
 _COMPONENT_WEIGHT = 0.1
-"""Weight of the loss of an extinction's components. It trains the primitives' shares, whose learning speed does not
-depend on it, and hardly moves primitives."""
+"""Weight of the loss of an extinction's components, its parts from single source grids. This loss trains the share of
+each component in a primitive. Shares are learned equally fast with any weight; with this one, primitives hardly
+move."""
 
 
 def photometric_reference(rendered: Tensor, truth: Tensor, ssim_weight: float) -> tuple[Tensor, dict[str, Tensor]]:
-    """Compute the photometric loss with kornia and autograd, on any device and dtype; the reference for the kernels.
+    """Return the photometric loss and its parts by kornia and autograd, on any device; the reference for the kernels.
 
     Args:
         rendered: (H, W, C) rendered image, values nominally in 0..1.
@@ -60,7 +61,7 @@ def photometric_reference(rendered: Tensor, truth: Tensor, ssim_weight: float) -
 
 
 class _Photometric(torch.autograd.Function):
-    """The photometric loss, by kernels that compute value and gradient together."""
+    """Autograd function of the photometric loss, whose kernels compute value and gradient together."""
 
     @staticmethod
     def forward(ctx: Any, rendered: Tensor, truth: Tensor, weight: float, parts: dict[str, Tensor]) -> Tensor:
@@ -80,7 +81,7 @@ class _Photometric(torch.autograd.Function):
 
 
 def photometric(settings: Mapping[str, Any]) -> Loss:
-    """Return the loss (1 - lambda) L1 + lambda (1 - SSIM), where lambda is ``settings["ssim_weight"]``."""
+    """Return a function for the loss (1 - lambda) L1 + lambda (1 - SSIM), with lambda = ``settings["ssim_weight"]``."""
     weight = float(settings["ssim_weight"])
 
     def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, Tensor]]:
@@ -97,12 +98,12 @@ def photometric(settings: Mapping[str, Any]) -> Loss:
 
 
 def l1(settings: Mapping[str, Any]) -> Loss:
-    """Return the loss mean |rendered - true|."""
+    """Return a function for the loss mean |rendered - true|; it reads no settings."""
     return _image_loss("l1", lambda rendered, truth: (rendered - truth).abs().mean())
 
 
 def compressed_loss(settings: Mapping[str, Any]) -> Loss:
-    """Return the L1 loss of log(1 + mu x) / log(1 + mu), mu = 16, which gives shadows more weight than highlights."""
+    """Return a function for the L1 loss of log(1 + mu x) / log(1 + mu), mu = 16, which gives shadows more weight."""
 
     def measure(rendered: Tensor, truth: Tensor) -> Tensor:
         scale = torch.log1p(torch.tensor(_MU))
@@ -113,7 +114,7 @@ def compressed_loss(settings: Mapping[str, Any]) -> Loss:
 
 
 def relative_loss(settings: Mapping[str, Any]) -> Loss:
-    """Return the loss squared error / squared rendered value, the divisor detached (Mildenhall 2022, RawNeRF)."""
+    """Return a function for the loss squared error / detached squared rendered value (Mildenhall 2022, RawNeRF)."""
 
     def measure(rendered: Tensor, truth: Tensor) -> Tensor:
         return ((rendered - truth) / (rendered.detach().clamp_min(0.0) + _DARK)).square().mean()
@@ -141,8 +142,8 @@ class PointLossResult:
         loss: differentiable scalar.
         parts: named parts of the loss, for the log, one number each.
         samples: the points and their true values.
-        rows, shares: active primitives and their parts of the values, from
-            :func:`~neuprim.core.volumes.points.volume_values_at`.
+        rows: indices of the primitives that are active in the frame; None for all.
+        shares: contributions of these primitives, from :func:`~neuprim.core.volumes.points.volume_values_at`.
     """
 
     loss: Tensor
@@ -152,7 +153,7 @@ class PointLossResult:
     shares: PointShares
 
     def contributions(self) -> Contributions:
-        """Return how much each primitive contributes to the points; call this method after the backward pass."""
+        """Return each primitive's contribution to extinction and error at the points, after the backward pass."""
         return Contributions(self.shares.weight, self.shares.error_weight, self.rows)
 
     def psnr(self) -> float:
@@ -162,7 +163,7 @@ class PointLossResult:
 
 
 def point_loss(model: Primitives, samples: PointSamples, settings: TrainSettings, threads: int = 0) -> PointLossResult:
-    """Compare the extinction and source radiance of a model with known values at points.
+    """Return the loss of a model's extinction and source radiance against known values at points.
 
     The loss sums mean squared errors, each error divided by its scale. Weights: 1 for the extinction, a small one for
     each extinction component, ``train.voxel_colour`` for the source radiance.
@@ -200,8 +201,8 @@ class MaxScreenSize:
     """Limits the largest semi-axis of each primitive to a fraction of its distance to the nearest training camera.
 
     A primitive close to one camera covers few pixels of other cameras, so images alone do not stop its growth. It
-    learns the mean colour behind it, and then covers the image of a camera between two training cameras. A distant
-    primitive may be large.
+    learns the mean colour of what is behind it. From a camera between two training cameras, it then covers the whole
+    image. A distant primitive may be large.
 
     Args:
         share: upper bound of largest semi-axis / distance.
@@ -213,11 +214,11 @@ class MaxScreenSize:
         self.share, self.every, self._eyes, self._tree = share, every, eyes, cKDTree(eyes.numpy())
 
     def due(self, step: int) -> bool:
-        """Return whether :meth:`apply` belongs to this step."""
+        """Return whether :meth:`apply` should run in this step."""
         return step % self.every == 0
 
     def apply(self, means: Tensor, log_scales: Tensor, when: Tensor | None = None) -> None:
-        """Shrink primitives beyond the limit, all three axes by one factor: changes ``log_scales`` (N, 3) in place.
+        """Shrink primitives that exceed the limit, all three axes by one factor, in place in ``log_scales`` (N, 3).
 
         ``when`` is (1,) bool on the device; if it is False, nothing changes.
         """

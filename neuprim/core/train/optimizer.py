@@ -1,8 +1,8 @@
-"""Adam with a step count for each row, that is, for each primitive.
+"""Adam optimizer with a step count for each primitive (row of a parameter), instead of one count for all.
 
-Population control creates primitives in the middle of a run. With one count for all rows, a new row with zero moments
-would take a first step of 3.2 times its rate (method: "splitting exactly"). So the bias correction uses a count for
-each row.
+Population control creates primitives in the middle of a run, with zero moments. With one count for all, the first step
+of a new primitive would be 3.2 times its learning rate (method: "splitting exactly"). So Adam's bias correction uses
+the primitive's own count.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ _INFINITY = 0x7F800000  # bits of a float32
 def adam_step_reference(
     value: Tensor, grad: Tensor, m: Tensor, v: Tensor, rate: float, age: Tensor, beta2: float = 0.999
 ) -> None:
-    """Take one Adam step (Kingma and Ba 2015) in place on an (N, ...) tensor.
+    """Take one Adam step (Kingma and Ba 2015) in place on an (N, ...) tensor, which has one row per primitive.
 
-    ``age`` (N,) counts the steps of each row, including this one.
+    ``m`` and ``v`` are Adam's moments. ``age`` (N,) counts the steps of each row, including this one.
     """
     shape = (-1, *[1] * (value.dim() - 1))
     m.mul_(BETA1).add_(grad, alpha=1 - BETA1)
@@ -43,10 +43,11 @@ def adam_step_reference(
 
 @exact_kernel
 def _adam_rows(start, stop, width, value, grad, m, v, rate, beta2, age, breaks, correction, root):  # type: ignore[no-untyped-def]
-    """Take the step of :func:`adam_step_reference` on rows start:stop of flat float32 arrays, ``width`` numbers a row.
+    """Take an Adam step on rows start:stop of flat float32 arrays, ``width`` numbers per row.
 
-    By age, ``correction`` is 1 / (1 - BETA1^age) and ``root`` is sqrt(1 / (1 - beta2^age)). Neighbouring rows mostly
-    have the same age. Runs of equal age end at ``breaks``: one long loop each, which vectorises.
+    The step is that of :func:`adam_step_reference`. ``correction[age]`` is 1 / (1 - BETA1^age) and ``root[age]`` is
+    sqrt(1 / (1 - beta2^age)). ``breaks`` are the rows whose ``age`` differs from the row before. Neighbouring rows
+    mostly have the same age. So the rows between two breaks are updated in one long loop, which vectorises.
     """
     b1, b2, eps = np.float32(BETA1), np.float32(beta2), np.float32(EPS)
     one_b1, one_b2 = np.float32(1 - BETA1), np.float32(1 - beta2)
@@ -68,7 +69,7 @@ def _adam_rows(start, stop, width, value, grad, m, v, rate, beta2, age, breaks, 
 
 @exact_kernel
 def _largest_gradient_bits_of_step(x):  # type: ignore[no-untyped-def]
-    """Return the largest bit pattern in |x|, for float32 x; it is at least that of infinity if x is not finite."""
+    """Return the largest bit pattern of |x| in float32 ``x``: at least that of infinity if x is not finite."""
     bits = x.view(np.uint32)
     largest = np.uint32(0)
     for k in range(bits.shape[0]):  # a maximum of integers vectorises, a sum of floats does not
@@ -85,9 +86,10 @@ def _all_gradients_finite(gradients: list[Tensor]) -> bool:
 
 @lru_cache(maxsize=4)
 def _bias_corrections(beta2: float, ages: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return 1 / (1 - BETA1^age) and sqrt(1 / (1 - beta2^age)), 0 for age 0, for ages 0 to ``ages`` - 1.
+    """Return two tables of Adam's bias correction, by age (number of steps of a row) from 0 to ``ages`` - 1.
 
-    Cached, because the powers take longer than the rest of a row's step.
+    The tables are 1 / (1 - BETA1^age) and sqrt(1 / (1 - beta2^age)), with 0 for age 0. They are cached, because the
+    powers take longer than the rest of a row's step.
     """
     age = np.arange(1.0, ages)
     return np.append(0.0, 1 / (1 - BETA1**age)), np.append(0.0, np.sqrt(1 / (1 - beta2**age)))
@@ -108,7 +110,7 @@ class RowAdam:
     Attributes:
         m, v: first and second moments by parameter name.
         age: (N,) int64, number of steps of each primitive.
-        beta2: decay of the second moment; short runs do better with a shorter memory.
+        beta2: decay of the second moment per step; a smaller value is better for short runs.
     """
 
     def __init__(self, specs: Iterable[ParameterSpec], params: dict[str, Tensor], beta2: float = 0.999) -> None:
@@ -119,7 +121,10 @@ class RowAdam:
         self.age = torch.zeros(params["means"].shape[0], dtype=torch.int64, device=params["means"].device)
 
     def step(self, params: dict[str, Tensor], rates: dict[str, float]) -> None:
-        """Update ``params`` in place from their ``.grad``, and clamp them to the lower bounds of their specs.
+        """Update ``params`` in place from their ``.grad``, and clamp them to the lower bounds in ``specs``.
+
+        Args:
+            rates: learning rate by parameter name.
 
         Raises:
             NonFiniteError: a gradient is NaN or infinite. Nothing is changed; the message names parameter and
@@ -137,11 +142,11 @@ class RowAdam:
         self._clamp(params)
 
     def step_recorded(self, params: dict[str, Tensor], rates: Tensor, refused: Tensor) -> None:
-        """Update float32 ``params`` on a GPU without waiting for it.
+        """Update float32 ``params`` on a GPU from their ``.grad``, without waiting for the GPU.
 
         Args:
-            rates: (P,) float32, a rate for each spec.
-            refused: (1,) int32; nothing is changed if it is set, and a gradient that is not finite sets it.
+            rates: (P,) float32, learning rate of each parameter, in the order of ``specs``.
+            refused: (1,) int32 flag. If it is set, nothing is changed. A gradient that is NaN or infinite sets it.
         """
         updates = self._updates(params, {spec.name: rate for spec, rate in zip(self.specs, rates, strict=True)})
         self._step_on_gpu(updates, torch.stack([update.rate for update in updates]), refused)
@@ -196,9 +201,10 @@ class RowAdam:
         parallel_for(step_rows, len(work), 1, 0)
 
     def select(self, rows: Tensor, fresh: Tensor) -> None:
-        """Apply a population change: row i takes the state of old row ``rows[i]``, or zeros where ``fresh``.
+        """Apply a population change to moments and step counts.
 
-        If the number of rows stays the same, the tensors keep their memory.
+        New primitive i takes the numbers of old primitive ``rows[i]``, or zeros where ``fresh[i]``. If the number of
+        primitives stays the same, the tensors keep their memory.
         """
         self.age = _select_rows(self.age, rows, fresh)
         for moments in (self.m, self.v):
@@ -206,7 +212,7 @@ class RowAdam:
                 moments[name] = _select_rows(value, rows, fresh)
 
     def state(self) -> dict[str, Tensor]:
-        """Return the tensors that a checkpoint needs."""
+        """Return moments and step counts as named tensors, for a checkpoint."""
         return {**{f"m.{k}": t for k, t in self.m.items()}, **{f"v.{k}": t for k, t in self.v.items()}, "age": self.age}
 
     def load_state(self, state: dict[str, Tensor]) -> None:

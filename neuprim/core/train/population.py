@@ -1,4 +1,8 @@
-"""Population control: strategies that add, move and remove primitives during a training. All splits are exact."""
+"""Population control: strategies that add, move and remove primitives (ellipsoids with a density) during a training.
+
+A split replaces a primitive by two smaller ones, its children. Splits are exact: a child has its parent's density and
+colour as functions of space.
+"""
 
 from __future__ import annotations
 
@@ -17,35 +21,40 @@ from neuprim.core.render.output import Contributions
 from neuprim.core.train.settings import PopulationSettings
 
 SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS = 0.5, 0.6, 0.9
-"""A child relative to its parent: shift over the longest semi-axis, factor on that axis, factor on the other two.
+"""Shape of a child relative to its parent: distance of the centres over the parent's longest semi-axis, factor on that
+axis, factor on the other two.
 
-Exact children carry their parent's sigma only inside themselves: what they leave uncovered vanishes, and what both
-cover counts twice. These cover 78 % of the parent and overlap in 2 %. Five other shapes trained no better.
-"""
+A child has its parent's density only inside its own ellipsoid. Density that no child covers is lost; density that both
+cover counts twice. These numbers cover 78 % of the parent and overlap in 2 %. Five other shapes trained no better."""
 
 SPLIT_GAUSSIAN = 1 / 1.6
-"""Factor on all semi-axes of a child in the rule of 3D Gaussian splatting (Kerbl et al. 2023: the inverse of 0.8 times
-the number of children), which the authors of the method use; such children cover 45 % of their parent."""
+"""Factor on all semi-axes of a child in :class:`GradientPopulation`, as the authors of the method use it. It is the
+rule of 3D Gaussian splatting (Kerbl et al. 2023): the inverse of 0.8 times the number of children. Such children cover
+45 % of their parent."""
 
 _GROWTH = 0.25
-"""Share of the primitives that one intervention adds: a split costs quality that training has to recover. It is larger
-if the count would otherwise not be reached."""
+"""Share of the primitives that one intervention (change of the population) adds. A split costs quality that training
+has to recover. More primitives are added if their number would otherwise not reach ``grow_to``."""
 
 _MIN_GROWTHS = 3
-"""Number of equal parts of the time from ``start`` to ``stop``; primitives are added at least at their boundaries."""
+"""Number of equal parts of the time from ``start`` to ``stop``. Primitives are added at least at the boundaries between
+the parts, even if a part is shorter than ``every`` steps."""
 
 
 def split_population(
     model: Primitives, parents: Tensor, shift: float, long_factor: float, other_factor: float
 ) -> dict[str, Tensor]:
-    """Split each parent primitive in two; return the children's parameters, all first children, then all second ones.
+    """Split each of P parent primitives in two; return the parameters of the children, name -> (2 P, ...).
 
-    Each child keeps its parent's density and colour as functions of space. The children lie at +-``shift`` x the
-    longest semi-axis from the parent's centre. This axis is multiplied by ``long_factor``, the other two by
-    ``other_factor``.
+    The first children of all parents come first, then all second children. Each child keeps its parent's density and
+    colour as functions of space. The children's centres lie on the parent's longest axis, at +-``shift`` x the
+    semi-axis from its centre. This semi-axis is multiplied by ``long_factor``, the other two by ``other_factor``.
+
+    Args:
+        parents: (P,) indices of the parents in ``model``.
 
     Raises:
-        FormError: ``on_split`` of a field returned tensors of other shapes.
+        FormError: ``on_split`` of the density or colour field returned tensors of other shapes.
     """
     rows = torch.cat([parents, parents])
     old = {n: v.detach()[rows].clone() for n, v in model.params.items()}
@@ -69,9 +78,13 @@ def split_population(
 
 @dataclass(frozen=True)
 class PopulationChange:
-    """A new set of primitives: row i of ``params`` comes from old row ``origin[i]``.
+    """Result of an intervention: a new set of N primitives, and the old primitive that each comes from.
 
-    ``fresh`` is (N,) bool, True for rows that start with zero Adam moments.
+    Attributes:
+        params: parameter name -> (N, ...) values.
+        origin: (N,) index of the old primitive from which each new one comes.
+        fresh: (N,) bool, True for primitives that start with zero Adam moments.
+        text: what changed, for logs.
     """
 
     params: dict[str, Tensor]
@@ -81,30 +94,34 @@ class PopulationChange:
 
 
 class Population(ABC):
-    """Base class of population control strategies, which observe all steps and change primitives when :meth:`due`."""
+    """Base class of population control strategies, which add, move and remove primitives during a training.
+
+    A strategy collects statistics in every step (:meth:`observe`). After the steps that :meth:`due` selects, it changes
+    the primitives (:meth:`intervene`).
+    """
 
     def __init__(self, settings: PopulationSettings) -> None:
         self.settings = settings
 
     def due(self, step: int, progress: float) -> bool:
-        """Return whether :meth:`intervene` should run after this step."""
+        """Return whether :meth:`intervene` runs after this step; ``progress`` is the used fraction of the budget."""
         s = self.settings
         return s.start <= progress < s.stop and step % s.every == 0
 
     @abstractmethod
     def observe(self, model: Primitives, contributions: Contributions) -> None:
-        """Collect statistics of a step, after its backward passes and before ``.grad`` is cleared."""
+        """Add a step to the statistics, after its backward passes and before ``.grad`` is cleared."""
 
     def sums(self) -> tuple[Tensor | None, ...]:
-        """Return the tensors that :meth:`observe` adds to, with None for each tensor that the next step creates."""
+        """Return the tensors in which :meth:`observe` adds up statistics, or None for each that does not exist yet."""
         return ()
 
     @abstractmethod
     def intervene(self, model: Primitives, extent: float) -> PopulationChange | None:
-        """Return the change of the population, or None for no change; resets the statistics."""
+        """Return the new primitives, or None for no change, and reset the statistics; ``extent`` is the scene's."""
 
     def state(self) -> dict[str, Tensor]:
-        """Return the tensors that a checkpoint needs."""
+        """Return the strategy's statistics as tensors, for a checkpoint."""
         return {}
 
     def load_state(self, state: dict[str, Tensor]) -> None:  # noqa: B027 - a strategy without statistics has none
@@ -122,12 +139,13 @@ class FixedPopulation(Population):
 
 
 class RelocatePopulation(Population):
-    """Strategy that moves the primitives of least weight to where weight x error is largest, and adds primitives.
+    """Strategy that moves primitives of little weight to where the error is largest, and adds primitives.
 
-    Each primitive with a large error splits in two: one child takes its row, one the row of a primitive with little
-    weight. ``idle`` limits which primitives are replaced. While there are fewer than ``grow_to``, further primitives
-    split into an old and a new row: a quarter of all, or as many as the remaining interventions need. Short budgets
-    intervene sooner.
+    A primitive's weight is the sum over pixels of alpha T, its share of the pixel. Its error is the same sum, with each
+    term multiplied by the pixel's error. Each primitive with a large error splits in two. One child replaces its
+    parent, the other replaces a primitive with little weight; ``idle`` limits which ones. While there are fewer than
+    ``grow_to`` primitives, further ones split into an old and a new row. An intervention adds a quarter of all
+    primitives, or more if the remaining interventions would not reach ``grow_to``. Short budgets intervene sooner.
     """
 
     def __init__(self, settings: PopulationSettings) -> None:
@@ -196,7 +214,10 @@ class RelocatePopulation(Population):
         return _split_population_into_rows(model, parents, torch.cat([idle, new]), births, text)
 
     def _count_births(self, count: int) -> int:
-        """Return how many primitives to add, so that each remaining intervention grows by the same factor."""
+        """Return how many primitives to add: a quarter of ``count``, or more if needed to reach ``grow_to``.
+
+        If more are needed, each remaining intervention multiplies the number by the same factor.
+        """
         missing = max((self.settings.grow_to or 0) - count, 0)
         due = math.ceil(count * ((1 + missing / count) ** (1 / (self._remaining + 1)) - 1) - 1e-9)
         return min(missing, max(int(_GROWTH * count), due, 1))
@@ -216,9 +237,10 @@ class RelocatePopulation(Population):
 def _split_population_into_rows(
     model: Primitives, parents: Tensor, others: Tensor, births: int, text: str
 ) -> PopulationChange:
-    """Split ``parents`` (P,): the first child takes the row of its parent, the second a row in ``others`` (P,).
+    """Return the change that splits each of the primitives ``parents`` (P,) into two children.
 
-    The last ``births`` rows in ``others`` are new.
+    The first child takes the row (index) of its parent, the second a row in ``others`` (P,), and replaces what is
+    there. The last ``births`` rows in ``others`` are new. ``text`` describes the change, for logs.
     """
     children = split_population(model, parents, SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS)
     rows = torch.cat([parents, others])
@@ -234,12 +256,13 @@ def _split_population_into_rows(
 
 
 class GradientPopulation(Population):
-    """Strategy of the authors of the method: clone, split and prune by the gradient of the density network.
+    """Strategy of the authors of the method: clone, split and remove primitives by the gradient of the density network.
 
-    Splits are exact (method: "Population"). A primitive's g is |dW1| + |db1| + |dw2| + |db2|, averaged over the steps
-    whose views show it. If g >= grow_threshold, it is cloned in place, both copies at half density, if its longest
-    semi-axis is <= clone_scale x extent, else split in two, with semi-axes / 1.6. It is removed if g < prune_threshold,
-    its longest semi-axis is > prune_scale x extent, or no view shows it.
+    A primitive's g is the gradient norm |dW1| + |db1| + |dw2| + |db2| of its network, averaged over the steps whose
+    views show the primitive. A primitive with g >= grow_threshold is cloned if its longest semi-axis is <= clone_scale
+    x extent: both copies stay in place and have half the density. Larger ones are split in two, with semi-axes / 1.6.
+    Splits are exact (method: "Population"). A primitive is removed if g < prune_threshold, if its longest semi-axis is
+    > prune_scale x extent, or if no view shows it.
     """
 
     def __init__(self, settings: PopulationSettings) -> None:

@@ -1,4 +1,4 @@
-"""Communication between the ranks of a training, by torch.distributed: gloo for CPU memory and NCCL for GPUs."""
+"""Communication between the ranks (processes) of a training by torch.distributed: gloo on the CPU, NCCL on GPUs."""
 
 from __future__ import annotations
 
@@ -75,11 +75,11 @@ def read_torchrun_rank(environment: Mapping[str, str] = os.environ) -> TorchrunR
 
 
 MEETING = timedelta(minutes=5)
-"""How long ranks wait for the last one to start."""
+"""Longest time that ranks wait for the last rank to start."""
 
 TIMEOUT = timedelta(hours=12)
-"""How long a rank waits for another one, which may generate data or evaluate. A rank that ends breaks its connections
-at once, and torchrun ends the others."""
+"""Longest time that a rank waits for another one, which may be generating data or evaluating. If a rank ends, its
+connections break at once, and torchrun ends the other ranks."""
 
 _FAILED = "failed"  # key of the store: the first failure of any rank
 
@@ -114,7 +114,7 @@ class ProcessGroup:
 
     @property
     def is_first(self) -> bool:
-        """Whether this is the rank that writes files and messages."""
+        """Whether this is rank 0, which writes files and messages."""
         return self.rank == 0
 
     # ------------------------------------------------------------ communication
@@ -142,7 +142,7 @@ class ProcessGroup:
             return int(self.store.get(name))
 
     def exchange(self, sent: Tensor, received: Tensor) -> None:
-        """Send row r of (R, n) ``sent`` to rank r; row r of ``received`` comes from rank r. Raises RankError."""
+        """Send row r of (R, n) ``sent`` to rank r; receive row r of ``received`` from rank r. Raises RankError."""
         with self._errors():
             dist.all_to_all_single(received, sent)
 
@@ -167,7 +167,7 @@ class ProcessGroup:
     def in_turn(self) -> Iterator[None]:
         """Run the block on rank 0 first, then on the first rank of every other machine, then on all other ranks.
 
-        So only one rank writes a cache file. Raises RankError.
+        So only one rank writes a cache file, and later ranks find it. Raises RankError.
         """
         turn = 0 if self.is_first else 1 if self.place.local_rank == 0 else 2
         for _ in range(turn):

@@ -1,9 +1,9 @@
 """Training steps as CUDA graphs: the launches of a step are recorded once and replayed, and the host does not wait.
 
 The arrays of a recorded step have fixed sizes (:class:`~neuprim.core.render.cuda.binning.FrameCapacity`). A step that
-does not fit, or whose numbers are not finite, sets a flag on the device; then it and all recorded steps after it change
-nothing. The host reads the flags a few steps later, and repeats such steps one by one, with larger arrays afterwards.
-So results are the bits of steps that are not recorded.
+does not fit them, or whose numbers are not finite, sets the flag "refused" on the device. Then this step and all
+replayed steps after it change nothing. The host reads the flag a few steps later. It takes these steps again without
+recordings, and uses larger arrays afterwards. So the results have the same bits as without recordings.
 """
 
 from __future__ import annotations
@@ -44,17 +44,18 @@ if TYPE_CHECKING:
     from neuprim.core.render.cuda.binning import FrameCapacity
 
 _IN_FLIGHT = 16
-"""Most recorded steps that the device has not finished when the host prepares another one."""
+"""Largest number of replayed steps whose results the host has not read yet."""
 
 _NUMBERS = 64
-"""At most so many numbers go to the device and back for a view, besides channels, and for the points."""
+"""Space for the numbers that a step sends to the device or back: at most so many for each view, besides its channels,
+and for the points."""
 
 _MOST_PROGRAMS = 16
-"""Most recordings kept; a recording is for one size of image and one set of intrinsics."""
+"""Largest number of recordings that are kept. Each image size and each set of intrinsics needs its own recording."""
 
 _IDLE_STEPS = 128
-"""A recording is replaced after so many steps without use. If it were sooner, data with many kinds of images would
-record a step each time and replay none."""
+"""A recording gives way to a new one only after so many steps without use. If it were sooner, data with many kinds of
+images would record a step each time and replay none."""
 
 
 class RecordableTrainer(Protocol):
@@ -87,7 +88,7 @@ class RecordableTrainer(Protocol):
 
 
 def recording_fault(trainer: RecordableTrainer) -> str | None:
-    """Return why steps of a training cannot be recorded; None if they can."""
+    """Return why the steps of a training cannot be recorded as CUDA graphs; None if they can."""
     model, renderer = trainer.current_model, trainer.renderer
     if trainer.device.type != device.CUDA:
         return "the model is not on a GPU"
@@ -104,13 +105,13 @@ def recording_fault(trainer: RecordableTrainer) -> str | None:
 
 @dataclass
 class _Inputs:
-    """The tensors of a step's views and points on the device. Those of a recording never change their memory."""
+    """The views and points that a step uses. The tensors of a recorded step's inputs never change their memory."""
 
     views: list[tuple[View, Pixels]]
     samples: PointSamples | None
 
     def tensors(self) -> list[Tensor]:
-        """Return all tensors but view matrices."""
+        """Return all tensors of views and points, except the view matrices of cameras."""
         found: list[Tensor | None] = []
         for view, pixels in self.views:
             found += [pixels.rgb, pixels.alpha, pixels.mask, *view.conditions.values()]
@@ -120,7 +121,7 @@ class _Inputs:
         return [x for x in found if x is not None]
 
     def shapes(self) -> tuple[Any, ...]:
-        """Return what a recording depends on: intrinsics and sizes, and which tensors there are."""
+        """Return a key of what a recording depends on: intrinsics, shapes, and which of the optional tensors exist."""
         found: list[Any] = [tuple(x.shape for x in self.tensors())]
         for view, pixels in self.views:
             camera = view.camera
@@ -133,7 +134,7 @@ class _Inputs:
 
 @dataclass
 class _Program:
-    """A recorded step: its inputs, its results and the function that runs it."""
+    """A recorded step: its inputs, its results and the function that replays it."""
 
     inputs: _Inputs
     given: Tensor  # float64: for each view its matrix and background; learning rates; scales of the points
@@ -144,7 +145,7 @@ class _Program:
 
 
 class _Flight(NamedTuple):
-    """A recorded step whose results the host has not read yet."""
+    """A replayed step whose results the host has not read yet."""
 
     step: int
     progress: float
@@ -160,7 +161,7 @@ class StepRecorder:
     """Records and replays the steps of one trainer. On the CPU, for tests, a replay just runs the step again.
 
     Attributes:
-        capacity: sizes of the arrays; None until a step that was not recorded gave the counts.
+        capacity: sizes of a recorded step's arrays; None until a step without recording showed which sizes are needed.
         replayed: number of steps that were replayed.
         repeated: number of replayed steps that were taken again because they, or an earlier step, were refused.
     """
@@ -180,13 +181,13 @@ class StepRecorder:
     # ------------------------------------------------------------ what the trainer calls
 
     def reset(self) -> None:
-        """Forget all recordings, because tensors were replaced; there must be no unread results."""
+        """Discard all recordings, because tensors that they use were replaced; all results must have been read."""
         assert not self._flights, "settle() comes first"
         self._programs.clear()
         self._seen.clear()
 
     def observe_counts(self, stats: RenderStats) -> None:
-        """Read the counts of a frame that was not recorded, and enlarge the arrays if a count exceeds the capacity."""
+        """Read the array sizes that an unrecorded frame needed; if they exceed the capacity, enlarge it and reset."""
         from neuprim.core.render.cuda.backend import frame_counts
         from neuprim.core.render.cuda.binning import FrameCapacity
 
@@ -197,7 +198,7 @@ class StepRecorder:
         self.reset()
 
     def take(self, tasks: list[ViewTask], samples: PointSamples | None, progress: float) -> StepReport | None:
-        """Replay one step. Return None if nothing is recorded for it yet; the trainer must then take the step."""
+        """Replay a step and return its report. If it has no recording, return None; the trainer must take the step."""
         trainer, sums = self.trainer, self.trainer.population.sums()
         if self._graphs.failed or self.capacity is None or trainer.fake_quantize is not None or trainer.zero_masks:
             return None
@@ -235,7 +236,7 @@ class StepRecorder:
         return report
 
     def settle(self, keep: int = 0) -> list[_Flight]:
-        """Read the results of replayed steps except the last ``keep``; return the steps to take again, in order."""
+        """Read results of replayed steps but the last ``keep``; return a refused step and all after it, to repeat."""
         while len(self._flights) > keep:
             first = self._flights[0]
             if first.event is not None:
@@ -286,7 +287,7 @@ class StepRecorder:
         return program
 
     def _make_program(self, inputs: _Inputs) -> _Program:
-        """Return a program whose own tensors have the shapes of ``inputs``."""
+        """Return a program (recorded step) with input tensors of its own, in the shapes of ``inputs``."""
         where, each = self.trainer.device, 16 + self.trainer.dataset.channels
         rates = each * len(inputs.views)
         scales = rates + len(self.trainer.current_model.specs)
@@ -329,7 +330,10 @@ class StepRecorder:
     def _take_step(
         self, inputs: _Inputs, backgrounds: list[Tensor], rates: Tensor
     ) -> tuple[Tensor, tuple[tuple[str, ...], ...]]:
-        """Take a step on the device; return (refused, numbers of each view) and the names of the parts of its loss."""
+        """Take a step on the device; return one tensor of results, and the names of the loss parts of each view.
+
+        The tensor has the flag "refused" and then :meth:`RenderedView.numbers` of each view.
+        """
         trainer, model, params = self.trainer, self.trainer.current_model, self.trainer.current_model.params
         # leaves of their own, as those of earlier steps may belong to another stream
         model.params = {name: value.detach().requires_grad_() for name, value in params.items()}

@@ -1,9 +1,10 @@
-"""Estimate the error in images, or at points, of removing a primitive or a unit of it, by one backward pass per view.
+"""Estimate the error in images, or at points, of removing a primitive or a part of one, by one backward pass per view.
 
-To first order an image changes by J delta when parameters change by delta. For random signs z per pixel and channel,
-the mean of (z . J delta)^2 is |J delta|^2 (Hutchinson 1990). A backward pass computes z . J. Removing a primitive
-changes a pixel by the primitive's weight w = alpha T times the difference of its colour from the colour behind it. The
-sum of w^2 over pixels predicts the loss better than the sum of w.
+A part (a prunable unit) is a group of parameters such as a neuron. To first order an image changes by J delta when
+parameters change by delta; J is its Jacobian. For random signs z per pixel and channel, the mean of (z . J delta)^2 is
+|J delta|^2 (Hutchinson 1990). A backward pass computes z . J. Removing a primitive changes a pixel by w times the
+difference of its colour from the colour behind it, where w = alpha T is the primitive's weight in the pixel. The sum of
+w^2 over pixels predicts the loss better than the sum of w.
 """
 
 from __future__ import annotations
@@ -28,11 +29,12 @@ class Sensitivity:
     """Mean squared effects of changes to a model, over the pixels and channels of some views, or over points.
 
     Attributes:
-        whole: (N,) effect of removing each primitive; in views, for a colour difference of 1 to what is behind.
+        whole: (N,) effect of removing each primitive; for views, its colour is taken to differ by 1 from what is
+            behind.
         seen: (N,) number of views, or frames, that show the primitive; where it is 0, the effects are unknown.
-        pieces: name of a unit -> (N,) effect of setting each primitive's unit to zero.
-        columns: parameter -> (C,) float64 effect of each column, if the values of all primitives change by independent
-            amounts of variance 1; for "quats", perpendicular to the quaternion, at unit norm.
+        pieces: name of a prunable unit, e.g. of a neuron -> (N,) effect of setting this unit of each primitive to zero.
+        columns: parameter -> (C,) float64 effect of changing each of its C numbers in all primitives, by independent
+            random amounts of variance 1. A change of "quats" is perpendicular to the quaternion, which has unit norm.
     """
 
     whole: Tensor
@@ -48,7 +50,7 @@ class Sensitivity:
 
 
 class _SensitivitySums:
-    """Sums of squared gradients over backward passes that start from random signs."""
+    """Sums of squared effects over several backward passes, each of which starts from random signs."""
 
     def __init__(self, model: Primitives) -> None:
         self._model, self._pieces = model, prunable_units_of_model(model.density, model.colour)
@@ -56,7 +58,7 @@ class _SensitivitySums:
         self.columns = {spec.name: torch.zeros(spec.size, dtype=torch.float64) for spec in model.specs}
 
     def add_pass(self, params: dict[str, Tensor]) -> None:
-        """Add the squared effects from the gradients of ``params`` after one backward pass."""
+        """Add the squared effects that follow from one backward pass: from ``params`` and their ``.grad``."""
         gradients = {
             name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in params.items()
         }
@@ -103,9 +105,9 @@ def sensitivity(
 
 
 def inner_sensitivity(model: Primitives, draws: Sequence[PointSamples], seed: int = 0, threads: int = 0) -> Sensitivity:
-    """Estimate the effects on the extinction at points, relative to typical extinction; returns CPU tensors.
+    """Estimate the effects of changes to a model on its extinction at points, relative to typical extinction.
 
-    It serves volumes with known extinction, because images do not show these effects.
+    Returns CPU tensors. It is meant for volumes with known extinction, because images do not show these effects.
 
     Args:
         draws: samples of points, each from one frame.

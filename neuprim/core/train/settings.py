@@ -1,7 +1,7 @@
-"""Settings of a run under ``train`` and ``model``, and checks of which settings a plugin reads.
+"""Settings of a run under ``model`` and ``train``, and checks that tasks and losses declare which settings they read.
 
-Only a task's ``build`` or a loss can read the settings in :data:`OPTIONAL`. Both declare in ``uses`` which of these
-settings they read, and get no others of them. Setting one that neither reads is an error.
+The settings in :data:`OPTIONAL` are read only by the ``build`` function of a task or by a loss. A task or loss lists in
+``uses`` those that it reads, and gets no others of them. It is an error to set one that neither of the two lists.
 """
 
 from __future__ import annotations
@@ -62,10 +62,10 @@ class ModelSettings:
 
     @property
     def count(self) -> int:
-        """Number of primitives.
+        """Number of primitives, as an integer.
 
         Raises:
-            ConfigError: ``primitives`` is "auto"; only the start of a training chooses the number.
+            ConfigError: ``primitives`` is "auto"; the number is only chosen when a training starts.
         """
         if self.primitives == "auto":
             raise ConfigError(
@@ -79,7 +79,8 @@ class ModelSettings:
         If both steps and seconds are limited, the smaller number is taken.
 
         Args:
-            pace: seconds per step and primitive; with None, "auto" stays if ``train.max_seconds`` is set.
+            pace: measured seconds per step, divided by the number of primitives. With None, "auto" stays if
+                ``train.max_seconds`` is set.
         """
         if self.primitives != "auto" or (pace is None and train.max_seconds is not None):
             return self
@@ -220,7 +221,7 @@ class TrainSettings:
             )
 
     def rate_factor(self, step: int, progress: float) -> float:
-        """Return the factor of all learning rates: warm-up, exponential decay to ``final_rate``, cool-down."""
+        """Return the factor of learning rates at ``progress`` of the budget: warm-up, exponential decay, cool-down."""
         factor = self.final_rate**progress
         if self.cooldown and progress > 1 - self.cooldown:
             factor *= max((1 - progress) / self.cooldown, MIN_COOLDOWN)
@@ -238,11 +239,13 @@ OPTIONAL = ("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_we
 
 
 class TrackedMapping(dict[str, Any]):
-    """The settings that a plugin's function gets. Reading a setting that the plugin did not declare is a ConfigError.
+    """Mapping of settings that is passed to a function of a plugin (a task or a loss).
+
+    Reading a setting that the plugin did not declare is a ConfigError.
 
     Args:
         owner: the plugin, for messages, e.g. ``"task 'glow'"``.
-        group: dotted name of the group, e.g. ``"model"``.
+        group: dotted name of the group of settings, e.g. ``"model"``.
         member: attribute of the plugin that declares what it reads, "uses" or "options".
     """
 
@@ -259,10 +262,10 @@ class TrackedMapping(dict[str, Any]):
 
 
 def build_settings(task: TaskSpec, model: ModelSettings, options: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return what a task's ``build`` and ``check`` get: the model settings that the task uses, and "options".
+    """Return the mapping that a task's ``build`` and ``check`` get: model settings that it uses, and "options".
 
     Args:
-        options: values by name; missing options take their defaults, unknown ones are ignored.
+        options: the task's own options by name; missing ones take their defaults, unknown ones are ignored.
     """
     return _track_used_settings("model", vars(model), task, options, f"task {task.name!r}")
 
@@ -270,7 +273,7 @@ def build_settings(task: TaskSpec, model: ModelSettings, options: Mapping[str, A
 def loss_settings(
     owner: TaskSpec | LossExtension, train: TrainSettings, options: Mapping[str, Any]
 ) -> Mapping[str, Any]:
-    """Return what a loss of ``owner`` (a task or a ``train.loss``) gets: settings that it uses, and "options"."""
+    """Return the mapping that a loss of ``owner`` (a task or a loss) gets: settings that it uses, and "options"."""
     who = f"the loss of task {owner.name!r}" if hasattr(owner, "build") else f"loss {owner.name!r}"
     return _track_used_settings("train", vars(train), owner, options, who)
 

@@ -1,9 +1,10 @@
-"""L1 + SSIM loss of two images and its analytic gradient, in fused separable passes on all CPU cores.
+"""L1 + SSIM loss of two images x and y, and its analytic gradient with respect to x, on all CPU cores.
 
-SSIM over an 11-tap Gaussian window (sigma 1.5), valid windows only. With window means a = E[x], b = E[y],
-A = 2ab + c1, B = 2(E[xy] - ab) + c2, C = a^2 + b^2 + c1, D = E[xx] - a^2 + E[yy] - b^2 + c2: SSIM = AB/(CD). Its
-derivatives with respect to E[x], E[xx] and E[xy] are spread back with the adjoint of the same blur. Where both images
-are equal, as in an empty background, SSIM is 1 and the gradient 0; these columns are skipped.
+SSIM uses an 11 x 11 Gaussian window (sigma 1.5), as two blurs of 11 taps, and only windows inside the image. With the
+window means a = E[x], b = E[y], A = 2ab + c1, B = 2(E[xy] - ab) + c2, C = a^2 + b^2 + c1 and D = E[xx] - a^2 + E[yy] -
+b^2 + c2, SSIM is AB/(CD). The adjoint of the blur turns its derivatives by E[x], E[xx] and E[xy] into a gradient per
+pixel. Where both images are equal, as in an empty background, SSIM is 1 and the gradient 0. So columns at the left and
+right that are equal in all rows of a window are skipped.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ SSIM_TAPS = 11
 _offsets = np.arange(SSIM_TAPS) - 5.0
 _gaussian = np.exp(-(_offsets**2) / (2 * 1.5**2))
 SSIM_WINDOW: list[float] = (_gaussian / _gaussian.sum()).tolist()
-"""The window of SSIM: 11 taps of a Gaussian of 1.5 pixels, as kornia has it."""
+"""Weights of the SSIM window along one axis: 11 taps of a Gaussian with sigma 1.5 pixels, as in kornia."""
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end, which lets LLVM vectorise
@@ -36,7 +37,11 @@ _C1, _C2 = f(0.01**2), f(0.03**2)
 
 @inline
 def _vertical_loss_moments(V, x, y, at, pitch, count):  # type: ignore[no-untyped-def]
-    """Blur x, y, x^2, y^2 and xy of flat images x and y over 11 rows from position ``at``, with sums in registers."""
+    """Blur x, y, x^2, y^2 and xy vertically, over 11 rows of the flat images ``x`` and ``y``, with sums in registers.
+
+    Result j of ``count`` begins at position ``at`` + j; ``pitch`` is the length of a row. ``V`` gets five blocks of
+    results, ``_WIDE`` numbers apart.
+    """
     for j in range(count):
         s0, s1, s2, s3, s4 = f(0), f(0), f(0), f(0), f(0)
         for k in range(SSIM_TAPS):
@@ -71,9 +76,10 @@ def _blur_loss_rows(out, V, step, count):  # type: ignore[no-untyped-def]
 
 @inline
 def _ssim_loss_derivatives(s, n, scale):  # type: ignore[no-untyped-def]
-    """Replace E[x], E[xx] and E[xy] in ``s`` by the derivatives of scale x SSIM; return the sum of SSIM.
+    """Replace window means by the derivatives of scale x SSIM with respect to them; return the sum of SSIM.
 
-    In each of the blocks E[x], E[y], E[xx], E[yy] and E[xy] of ``s``, the first ``n`` numbers count.
+    ``s`` has five blocks: E[x], E[y], E[xx], E[yy] and E[xy]. The first ``n`` numbers of each are used. Those of E[x],
+    E[xx] and E[xy] are replaced.
     """
     total = f(0)
     for j in range(n):
@@ -93,7 +99,11 @@ def _ssim_loss_derivatives(s, n, scale):  # type: ignore[no-untyped-def]
 
 @exact_kernel
 def _find_unequal_columns(start, stop, x, y, height, unequal):  # type: ignore[no-untyped-def]
-    """For rows i in start:stop, set unequal[i] to the range [first, end) where x and y differ; first > end if none."""
+    """Set unequal[i], for image rows i in start:stop, to the column range [first, end) where images differ.
+
+    ``x`` and ``y`` are flat images with ``height`` rows; a column is one channel of one pixel. Equal rows get first >
+    end.
+    """
     n = x.shape[0] // height
     for i in range(start, stop):
         first, end = 0, n
@@ -106,10 +116,11 @@ def _find_unequal_columns(start, stop, x, y, height, unequal):  # type: ignore[n
 
 @inline
 def _widest_columns(unequal, start, stop, before, after, most):  # type: ignore[no-untyped-def]
-    """Return the range [first, end) that contains the unequal elements of image rows start:stop.
+    """Return one range [first, end) of columns that contains all differences of the two images in rows start:stop.
 
-    The range begins ``before`` elements earlier and ends ``after`` elements later, within [0, most). If no elements
-    differ, it is empty (end is first).
+    ``unequal`` has the range of each row, from :func:`_find_unequal_columns`. The result begins ``before`` columns
+    earlier and ends ``after`` columns later, within [0, most). If nothing differs, it is empty (end is first); for
+    images narrower than 20 pixels, it may not be.
     """
     first, end = most, np.int64(0)
     for i in range(start, stop):
@@ -120,10 +131,11 @@ def _widest_columns(unequal, start, stop, before, after, most):  # type: ignore[
 
 @kernel
 def _ssim_loss_maps(start, stop, x, y, height, channels, unequal, maps):  # type: ignore[no-untyped-def]
-    """Write window rows start:stop of the derivative maps of the mean SSIM; return the sum of SSIM over them.
+    """Write derivatives of the mean SSIM for window rows start:stop; return the sum of SSIM over these rows.
 
-    ``x`` and ``y`` are flat images of (height, width, channels). ``maps`` holds three planes of all windows, with a
-    zero border of 10 windows on every side.
+    ``x`` and ``y`` are flat images of (height, width, channels). ``unequal`` comes from :func:`_find_unequal_columns`.
+    The planes of ``maps`` get the derivatives with respect to E[x], E[xx] and E[xy]. They have a zero border of 10
+    windows on every side.
     """
     n = x.shape[0] // height
     reach = (SSIM_TAPS - 1) * channels
@@ -153,7 +165,11 @@ def _ssim_loss_maps(start, stop, x, y, height, channels, unequal, maps):  # type
 
 @inline
 def _loss_gradient(gr, x, y, s, n, l1_share, weight):  # type: ignore[no-untyped-def]
-    """Write the gradient of L1 and SSIM into ``gr``, from the three blurred maps ``s``; return the sum of |x - y|."""
+    """Write the gradient of the loss with respect to ``x`` into ``gr``, for ``n`` numbers; return the sum of |x - y|.
+
+    ``s`` has the three derivative maps of SSIM after the adjoint blur, in blocks. ``l1_share`` is the L1 gradient of a
+    number where x > y, ``weight`` the weight of SSIM.
+    """
     line = f(0)
     for j in range(n):
         a, b = x[j], y[j]
@@ -166,7 +182,11 @@ def _loss_gradient(gr, x, y, s, n, l1_share, weight):  # type: ignore[no-untyped
 
 @kernel
 def _spread_loss_gradient(start, stop, x, y, height, channels, unequal, maps, weight, grad):  # type: ignore[no-untyped-def]
-    """Write rows start:stop of d loss / d x into ``grad``, by the adjoint of the blur; return the sum of |x - y|."""
+    """Write rows start:stop of the gradient d loss / d x into ``grad``; return the sum of |x - y|.
+
+    The adjoint of the SSIM blur distributes the derivatives in ``maps`` over the pixels of each window. ``weight`` is
+    the weight of SSIM in the loss.
+    """
     n = x.shape[0] // height
     pitch = maps.shape[2]
     reach = (SSIM_TAPS - 1) * channels
@@ -195,7 +215,7 @@ _buffers = threading.local()
 
 
 def _bordered_loss_maps(rows: int, columns: int) -> Any:
-    """Return memory for three maps with a zero border; this thread reuses it for the next image of this size."""
+    """Return memory for three maps (3, rows, columns) with a zero border; a thread reuses it while sizes are equal."""
     maps = getattr(_buffers, "maps", None)
     if maps is None or maps.shape != (3, rows, columns):
         maps = _buffers.maps = np.zeros((3, rows, columns), np.float32)
@@ -205,7 +225,7 @@ def _bordered_loss_maps(rows: int, columns: int) -> Any:
 def ssim_loss_with_gradient(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, Tensor]:
     """Return (mean absolute difference, mean SSIM) as (2,) float64, and the (H, W, C) gradient of the loss.
 
-    The loss is (1 - weight) L1 + weight (1 - SSIM).
+    The loss is (1 - weight) L1 + weight (1 - SSIM). The gradient is with respect to ``rendered``.
 
     Args:
         rendered, truth: (H, W, C) float32, at least 11 x 11 pixels, at most 51 channels.

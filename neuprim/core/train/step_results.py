@@ -24,7 +24,9 @@ class StepReport:
 
     Attributes:
         seconds: training time up to the end of this step.
+        parts: named parts of the loss.
         psnr: PSNR of the training view (mean over views), or of the extinction at points in a step without views.
+        primitives: number of primitives after the step.
         change: text about what population control changed; None if nothing.
     """
 
@@ -39,13 +41,16 @@ class StepReport:
 
     @classmethod
     def pending(cls, settle: Callable[[], None], **known: Any) -> StepReport:
-        """Return a report without loss, parts and psnr; calling ``settle`` passes them to :meth:`resolve`."""
+        """Return a report whose loss, parts and PSNR are not known yet. ``known`` has other fields.
+
+        The first access to one of these three calls ``settle``, which must pass them to :meth:`resolve`.
+        """
         report = cls.__new__(cls)
         report.__dict__.update(known, _settle=settle)
         return report
 
     def resolve(self, loss: float, parts: dict[str, float], psnr: float) -> None:
-        """Fill a pending report."""
+        """Set the loss, its parts and the PSNR of a pending report."""
         self.__dict__.update(loss=loss, parts=parts, psnr=psnr)
 
     def __getattr__(self, name: str) -> Any:
@@ -56,7 +61,7 @@ class StepReport:
 
 
 class ViewTask(NamedTuple):
-    """A training view to render: its index, background and pixels, and the index of the next view, if known."""
+    """A training view to render: its index, background, selected pixels, and the index of the next view, if known."""
 
     view: int
     background: Tensor
@@ -68,8 +73,8 @@ class ViewResult(NamedTuple):
     """Results of one view of a step.
 
     Attributes:
-        loss: the view's part of the step's loss; that of the last view includes points and regularisers.
-        parts: named parts of the loss; those of the last view include points.
+        loss: the view's part of the step's loss. For the last view, it includes points and regularisers.
+        parts: named parts of the loss. For the last view, they include points.
         gain: gradient of the logarithm of the view's exposure, one number per channel; None if none are learned.
         correction: gradient of the view's corrections; None if none are learned.
     """
@@ -85,7 +90,7 @@ class ViewResult(NamedTuple):
 
 @dataclass
 class RenderedView:
-    """A rendered view and its loss; the backward pass fills ``contributions``."""
+    """A rendered view and its loss against the true image; the backward pass fills ``contributions``."""
 
     loss: Tensor
     parts: dict[str, float | Tensor]
@@ -96,7 +101,7 @@ class RenderedView:
     contributions: Contributions
 
     def numbers(self, cost: Tensor, more: Iterable[Tensor] = ()) -> Tensor:
-        """Return ``cost``, ``squared``, ``counted``, parts and ``more`` in one float64 tensor, to wait only once."""
+        """Return ``cost``, ``squared``, ``counted``, parts and ``more`` in one float64 tensor: one wait for the GPU."""
         values = (cost.detach(), self.squared, self.counted, *self.parts.values(), *more)
         like = self.squared
         return torch.stack(
@@ -110,7 +115,7 @@ class RenderedView:
 def compare_view(
     output: RenderOutput, loss: Loss, view: View, pixels: Pixels, background: Tensor, progress: float = 0.0
 ) -> RenderedView:
-    """Compare a rendered view with its image over the same (C,) ``background``, without waiting for a GPU."""
+    """Compare a rendered view with its image, composited over the same (C,) ``background``; does not wait for a GPU."""
     truth = pixels.over(background)
     rgb = output.rgb if pixels.mask is None else torch.where(pixels.mask[..., None], output.rgb, truth)
     value, parts = loss(rgb, truth, Supervision(view, pixels.mask, pixels.alpha, progress))
@@ -125,7 +130,7 @@ def compare_view(
 
 
 def summarize_numbers(numbers: Sequence[float], parts: Sequence[str]) -> tuple[float, dict[str, float], float]:
-    """Return loss, parts by name and PSNR from :meth:`RenderedView.numbers`."""
+    """Return (loss, parts by name, PSNR) from the values of :meth:`RenderedView.numbers` and the names ``parts``."""
     cost, squared, counted, *values = numbers
     mse = squared / counted
     psnr = -10 * math.log10(max(mse, 1e-20)) if math.isfinite(mse) else math.nan
@@ -140,5 +145,5 @@ def summarize_views(views: list[ViewResult]) -> tuple[float, dict[str, float], f
 
 
 def name_views(names: Sequence[str]) -> str:
-    """Return the name of a step for reports, from the names of its views."""
+    """Return a text that names the views of a step, for reports: the last view, and the number of others."""
     return names[-1] if len(names) == 1 else f"{names[-1]} and {len(names) - 1} more"

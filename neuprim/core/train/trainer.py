@@ -73,11 +73,11 @@ class Trainer:
         step: number of finished steps.
         elapsed: seconds of training, without held-out evaluations and file writes.
         fake_quantize: differentiable function that rounds parameters as a file would store them; None for none.
-        zero_masks: parameter -> (N, ...) bool, True for values that stay zero.
+        zero_masks: parameter -> (N, ...) bool, True for values that training keeps at zero.
         rank: rank of this process among all processes that train the model.
         ranks: number of processes that train the model.
         stop_requested: function called after every step; True ends the training, see :attr:`stopping`.
-        recorder: replays steps as CUDA graphs; None where they cannot be recorded. :meth:`settle` waits for them.
+        recorder: replays steps as CUDA graphs, see :meth:`settle`; None where steps cannot be recorded.
     """
 
     rank, ranks = 0, 1
@@ -124,13 +124,13 @@ class Trainer:
 
     @property
     def model(self) -> Primitives:
-        """The model after the last step."""
+        """The model after the last step. Reading it waits for all steps that a GPU has not finished."""
         self.settle()
         return self.current_model
 
     @property
     def progress(self) -> float:
-        """Used fraction of the budget, of steps or of seconds, whichever is larger; schedules depend on this value."""
+        """Used fraction of the budget, 0 to 1: of steps or of seconds, whichever is larger. Schedules depend on it."""
         steps = self.settings.iterations
         done = 0.0 if steps is None else self.step / steps if steps else 1.0
         if self.settings.max_seconds is not None:
@@ -157,7 +157,7 @@ class Trainer:
     # ------------------------------------------------------------ the loop
 
     def run(self) -> Iterator[StepReport]:
-        """Run steps until the budget is used, yielding each result; the caller may save the state or stop."""
+        """Run steps until the budget is used, yielding each result; then the caller may save the state or stop."""
         while not self.finished:
             yield self.train_step()
 
@@ -166,7 +166,7 @@ class Trainer:
 
         Raises:
             NonFiniteError: a loss, gradient or parameter is NaN or infinite; the step changes no parameter.
-            DeviceMemoryError: the GPU has too little memory for a step; files are intact.
+            DeviceMemoryError: the GPU has too little memory for a step; saved checkpoints are intact.
         """
         with self._limit_resources(), self._turn:
             start, progress = time.perf_counter(), self.progress
@@ -203,7 +203,7 @@ class Trainer:
     def _take_step(
         self, report: StepReport, tasks: list[ViewTask], samples: PointSamples | None, progress: float, start: float
     ) -> None:
-        """Take a step that is not recorded, without population control, and fill ``report``."""
+        """Take a step without CUDA graph or population control, from views ``tasks`` and ``samples`` of points."""
         model = self.current_model
         for value in model.params.values():
             value.grad = None
@@ -247,9 +247,9 @@ class Trainer:
         report.resolve(cost, parts, psnr)
 
     def settle(self, keep: int = 0) -> None:
-        """Wait for all recorded steps except the last ``keep``, and repeat those that the device refused.
+        """Wait for all replayed steps except the last ``keep``, and repeat those that the GPU refused.
 
-        Raises the errors of :meth:`train_step`.
+        It refuses steps that need larger arrays or are not finite. Raises the errors of :meth:`train_step`.
         """
         if self.recorder is None:
             return
@@ -279,7 +279,7 @@ class Trainer:
     # ------------------------------------------------------------ methods that DistributedTrainer overrides
 
     def _draw_views(self) -> list[ViewTask]:
-        """Draw the views of a step with their backgrounds; none for ``train.supervision=voxels``."""
+        """Draw the training views of a step with their backgrounds; return [] for ``train.supervision=voxels``."""
         if self.settings.supervision == "voxels":
             return []
         drawn = [self._draw_view() for _ in range(self.settings.views_per_step)]
@@ -287,15 +287,15 @@ class Trainer:
         return [ViewTask(*view, then) for view, then in zip(drawn, upcoming, strict=True)]
 
     def _exchange_gradients(self, contributions: Contributions) -> Contributions:
-        """Hook after each view's backward pass; returns ``contributions``. ``.grad`` already sums over views."""
+        """Return ``contributions``; called after each view's backward pass. ``.grad`` already sums over views."""
         return contributions
 
     def _combine_views(
         self, results: list[ViewResult], each: list[Contributions], start: float
     ) -> tuple[list[ViewResult], Contributions]:
-        """Return the results of all views of the step, in order, and the sum of their contributions.
+        """Return the results of all views of the step, in order, and the sum of the views' contributions ``each``.
 
-        ``start`` is the time at the beginning of the step.
+        ``start`` is the time at the start of the step.
         """
         return results, each[0] if len(each) == 1 else sum_contributions(each, self.current_model.count)
 
@@ -305,7 +305,7 @@ class Trainer:
     # ------------------------------------------------------------ parts of a step
 
     def _draw_view(self) -> tuple[int, Tensor, PixelStride]:
-        """Draw the next view (random order, without replacement), its background and its pixels."""
+        """Draw the next training view (random order, without replacement), its background and its selected pixels."""
         train, settings = self.dataset.train, self.settings
         if len(self.order) == 0:
             self.order = torch.randperm(len(train), generator=self.generator)
@@ -324,9 +324,9 @@ class Trainer:
         return torch.full((channels,), 1.0 if choice == "white" else 0.0)
 
     def _draw_points(self) -> PointSamples | None:
-        """Draw the points of this step; None if the step uses none.
+        """Draw the points with known extinction for this step; None if the step uses none.
 
-        With ``train.supervision=both``, steps whose number in logs is a multiple of ``voxels_every`` use points.
+        With ``train.supervision=both``, steps whose number (from 1) is a multiple of ``voxels_every`` use points.
         """
         source = self.settings.supervision
         if source == "images" or (source == "both" and (self.step + 1) % self.settings.voxels_every):
@@ -363,21 +363,21 @@ class Trainer:
         return compare_view(output, self.loss, view, pixels, background, progress)
 
     def compare_points(self, samples: PointSamples) -> PointLossResult:
-        """Compare the model with known values at points."""
+        """Return the loss between the model and known values (extinction and source radiance) at points."""
         return point_loss(self._quantized_model(), samples, self.settings, self.renderer.threads)
 
     @property
     def has_anisotropy_loss(self) -> bool:
-        """Whether this step has the regulariser that begins at ``train.anisotropy_from``."""
+        """Whether this step's loss has the anisotropy regulariser, which begins at ``train.anisotropy_from``."""
         return self.settings.anisotropy_weight > 0 and self.step >= self.settings.anisotropy_from
 
     @property
     def limits_size(self) -> bool:
-        """Whether this step limits the sizes of primitives on the screen."""
+        """Whether this step limits the sizes of primitives as seen from the nearest camera (``train.angular_size``)."""
         return self.max_screen_size is not None and self.max_screen_size.due(self.step)
 
     def total_loss(self, loss: Tensor | None, points: PointLossResult | None = None) -> Tensor:
-        """Return the sum of the losses of views, points (None: none in this step) and regularisers."""
+        """Return the sum of a view's ``loss``, the loss of ``points`` (None: not in this step) and the regularisers."""
         if points is not None:
             loss = points.loss if loss is None else loss + self.settings.voxel_weight * points.loss
         assert loss is not None
@@ -389,7 +389,7 @@ class Trainer:
         return loss
 
     def limit_model(self, sizes: bool, when: Tensor | None = None) -> None:
-        """Limit extinction to the largest of the data, and with ``sizes`` the sizes of primitives on the screen.
+        """Limit extinction to the largest of the data and, with ``sizes``, the sizes of primitives seen from cameras.
 
         ``when`` is (1,) bool on the device; if it is False, nothing changes.
         """
@@ -402,12 +402,12 @@ class Trainer:
     def _backward(
         self, loss: Tensor, view: RenderedView | None, points: PointLossResult | None
     ) -> tuple[float, dict[str, float], float]:
-        """Run the backward pass of ``loss``, which adds to ``.grad`` of the parameters.
+        """Run the backward pass, which adds to ``.grad`` of the parameters; return (loss, its named parts, PSNR).
 
-        Returns the loss, and the parts and the PSNR of the view.
+        The PSNR is that of ``view``, or of the extinction at ``points`` if ``view`` is None.
 
         Raises:
-            NonFiniteError: the loss is NaN or infinite; names the view or points.
+            NonFiniteError: the loss is NaN or infinite; the message names the view or points.
         """
         more = {} if points is None else points.parts
         if view is None:

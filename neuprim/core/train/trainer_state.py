@@ -1,4 +1,4 @@
-"""Check a training's settings, and its state, which :meth:`~neuprim.core.train.trainer.Trainer.state` returned."""
+"""Checks of a training's settings, and of saved states from :meth:`~neuprim.core.train.trainer.Trainer.state`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.settings import TrainSettings
 
 _FIXED = ("params", "adam", "exposure", "correction")
-"""Groups of tensors that every state of the same settings has."""
+"""Groups of state tensors, e.g. "adam" of "adam.age". All states with the same settings have the same tensors in a
+group."""
 
 
 def select_state_tensors(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
@@ -34,10 +35,12 @@ def check_state(
     """Check that a saved state fits the trainer that will continue from it.
 
     Args:
+        tensors, header: the saved state.
         where: file of the saved state, for messages.
+        own_tensors, own_header: current state of the trainer.
 
     Raises:
-        CheckpointError: the saved state belongs to other settings or data; names what differs.
+        CheckpointError: the saved state belongs to other settings or data; the message says what differs.
     """
     step, elapsed, views = (header.get(name) for name in ("step", "elapsed", "views"))
     if not isinstance(step, int) or not isinstance(elapsed, (int, float)) or step < 0 or not math.isfinite(elapsed):
@@ -92,7 +95,7 @@ def _find_state_fault(tensors: Mapping[str, Tensor], own: Mapping[str, Tensor], 
 
 
 def check_training_settings(settings: TrainSettings, model: Primitives, dataset: Dataset) -> TrainSettings:
-    """Check the settings against the model and the data; return them with ``supervision="auto"`` replaced."""
+    """Check settings against model and data; return them with ``supervision`` "auto" replaced by its meaning."""
     if len(dataset.train) == 0:
         raise DataError(f"{dataset.name}: the training split is empty")
     names = [spec.name for spec in model.specs]

@@ -1,4 +1,8 @@
-"""Training views: prefetching, pixel strides, and learned exposures and corrections of cameras and conditions."""
+"""Training views (cameras with images): loading in advance, strides that select pixels, and learned numbers of a view.
+
+A view's learned numbers are its exposure, and corrections of its camera and of its conditions, such as a light
+position.
+"""
 
 from __future__ import annotations
 
@@ -20,36 +24,39 @@ from neuprim.core.data.dataset_check import check_pixels
 from neuprim.core.data.image_views import StoredPixels
 
 _MIN_SIDE = 11
-"""Fewest pixels per side that a stride may leave: the size of the SSIM window."""
+"""Smallest width and height in pixels of a view after a stride selected its pixels: the size of the SSIM window."""
 
 _PIXELS_PER_PRIMITIVE = 1.5
-"""Number of covered pixels that take as long in a step on the CPU as one primitive."""
+"""Number of covered pixels (alpha above 0) that take as long as one primitive, in a training step on the CPU."""
 
 GPU_LAUNCHES = 70_000
-"""Number of primitives that take as long in a step on a GPU as its launches, which small views do not shorten."""
+"""Time of the kernel launches of a training step on a GPU, as the number of primitives that take as long. Smaller views
+do not shorten this time."""
 
 _COUNTED_VIEWS = 16
-"""Views whose covered pixels are counted, spread over the training set."""
+"""Largest number of training views whose covered pixels are counted; they are spread evenly over the training set."""
 
 _STRIDE_STAGES = ((0.7, 1), (0.9, 2))
-"""(used fraction of the budget, divisor of the automatic stride until then); after the last one, views are whole."""
+"""Stages of the automatic stride: (used fraction of the budget at which the stage ends, divisor of the stride). After
+the last stage, whole views are rendered."""
 
 _BETA1, _BETA2, _EPS = 0.9, 0.99, 1e-8
 
 _CORRECTION_RATES: dict[Correction, list[float]] = {"pose": [4e-3] * 6, "offset": [5e-3] * 3, "factor": [5e-3]}
-"""Initial learning rate of each number by kind, per step that uses the view; poses are in radians and units."""
+"""Kind of correction -> initial learning rate of each of its numbers, per step that uses the view. The six numbers of a
+pose are a rotation vector in radians and a shift in the ``unit`` of :class:`ViewCorrections`."""
 
 _CORRECTION_START, _CORRECTION_FINAL = 0.1, 0.02
-"""Used fraction of the budget when corrections begin, as an early model is too blurred to correct anything by, and
-their last rate as a fraction of the first."""
+"""Used fraction of the budget at which corrections of views begin, and their last learning rate as a fraction of the
+first. Before that, the model is too blurred to determine corrections."""
 
 
 class PixelLoader:
-    """Loads the pixels of training views.
+    """Loads the pixels of training views, for a model on the device ``where``.
 
-    For a GPU, a thread loads the next view in advance, which does not change the order of the views. Views that fit in
-    a quarter of the free memory are cached, as loading a large view again takes longer than a step. Stored images are
-    cached as they are, most of them in 8 bits.
+    For a GPU, a thread loads the next view in advance; this does not change the order of the views. Views are cached in
+    up to a quarter of the free GPU memory, as loading a large view again takes longer than a step. Stored images are
+    cached before their conversion to floats, most of them in 8 bits.
     """
 
     def __init__(self, dataset: Dataset, where: torch.device) -> None:
@@ -66,7 +73,10 @@ class PixelLoader:
         return pixels if self._device.type == device.CPU else pixels.to(self._device)
 
     def take(self, index: int, upcoming: int | None) -> Pixels:
-        """Return the pixels of view ``index`` and start loading view ``upcoming``; raises the errors of loading."""
+        """Return the pixels of view ``index``; for a GPU, start loading view ``upcoming`` (None: no view) on a thread.
+
+        Raises the errors of loading.
+        """
         if self._device.type == device.CPU:
             return self._load(index)
         pending, self._pending = self._pending, None
@@ -94,7 +104,7 @@ class PixelStride(NamedTuple):
     row: int = 0
 
     def take(self, view: View, pixels: Pixels) -> tuple[View, Pixels]:
-        """Return the view and its pixels, reduced to the selected pixels; rays and colours are exact, not averaged."""
+        """Return view and pixels, reduced to the selected pixels. Rays and colours are exact, not averaged."""
         if self.step == 1:
             return view, pixels
         return replace(view, camera=view.camera.strided(*self)), pixels.strided(*self)
@@ -113,10 +123,15 @@ def count_covered_pixels(views: ViewSet) -> float:
 
 
 def choose_stride(stride: int | Literal["auto"], covered: float, primitives: int, progress: float) -> int:
-    """Return the stride of pixels at ``progress``, the used fraction of the budget.
+    """Return the stride of the pixels to render at ``progress``, the used fraction of the budget.
 
-    ``auto`` balances the work per pixel, which falls with the square of the stride, and the work per primitive, which
-    does not. Other strides learn less per second. The result depends only on the arguments, not on measured times.
+    A ``stride`` that is a number is returned unchanged. ``auto`` balances two times of a step. The time of the pixels
+    falls with the square of the stride, the time of the primitives stays. Other strides learn less per second. The
+    result depends only on the arguments, not on measured times.
+
+    Args:
+        covered: mean number of covered pixels (alpha above 0) per view.
+        primitives: number of primitives; for a GPU, plus :data:`GPU_LAUNCHES`.
     """
     if stride != "auto":
         return stride
@@ -126,7 +141,7 @@ def choose_stride(stride: int | Literal["auto"], covered: float, primitives: int
 
 
 def draw_stride(stride: int, view: View, generator: torch.Generator) -> PixelStride:
-    """Draw a random first pixel for a stride. The stride is lowered until at least 11 x 11 pixels remain."""
+    """Select every ``stride``-th pixel from a random first one; lower the stride until 11 x 11 pixels remain."""
     stride = max(min(stride, min(view.camera.width, view.camera.height) // _MIN_SIDE), 1)
     if stride == 1:
         return PixelStride()
@@ -141,7 +156,7 @@ def hash_training_views(views: ViewSet) -> str:
 
 
 class _NumbersOfViews:
-    """Parameters of each training view, which Adam learns with the model in the steps that use the view."""
+    """Parameters of each training view, which Adam learns in the steps that use the view, with initial ``rates``."""
 
     def __init__(self, views: int, rates: list[float], device: torch.device) -> None:
         self.rates = torch.tensor(rates, device=device)
@@ -151,17 +166,17 @@ class _NumbersOfViews:
         self._rows: dict[int, Tensor] = {}
 
     def row(self, index: int) -> Tensor:
-        """Return the parameters of a view as a leaf tensor; call :meth:`gradient` after the backward pass."""
+        """Return the parameters of view ``index`` as a new leaf tensor, whose gradient :meth:`gradient` returns."""
         self._rows[index] = row = self.numbers[index].clone().requires_grad_()
         return row
 
     def gradient(self, index: int) -> list[float] | None:
-        """Return the gradient of a view's parameters after the backward pass; None if there is none."""
+        """Return the gradient of a view's parameters after :meth:`row` and a backward pass; None if there is none."""
         grad = self._rows.pop(index).grad
         return None if grad is None else [float(x) for x in grad.tolist()]
 
     def step(self, gradients: Mapping[int, list[float] | None], factor: float = 1.0) -> None:
-        """Update the parameters of views by ``gradients``, keyed by view; ``factor`` multiplies the rates."""
+        """Take an Adam step with ``gradients``, view index -> gradient or None; ``factor`` multiplies the rates."""
         for index, numbers in gradients.items():
             if numbers is None:
                 continue
@@ -187,7 +202,7 @@ class Exposures(_NumbersOfViews):
     """A learned gain per training view and channel, which multiplies the rendered image before the loss.
 
     Adam updates the logarithms of the gains. The geometric mean over the views stays 1, so that the model has the mean
-    exposure of the photographs. Held-out views are rendered with this exposure.
+    exposure of the photographs. Held-out views are rendered with this mean exposure.
     """
 
     def __init__(self, views: int, channels: int, rate: float, device: torch.device) -> None:
@@ -204,16 +219,17 @@ class Exposures(_NumbersOfViews):
 
 
 class ViewCorrections(_NumbersOfViews):
-    """Learned corrections of cameras and conditions whose given values are inexact (``Dataset.refine``).
+    """Learned corrections of training views whose given cameras or conditions are inexact (``Dataset.refine``).
 
-    A pose is a rotation around the point that the cameras look at, and a shift. A rotation around the camera would
-    shift the image like a shift does, and Adam learns either slowly. All cameras together are not moved, rotated or
-    scaled: images do not determine that, and the model would move away from the held-out cameras.
+    The correction of a pose is a shift, and a rotation around the point that the cameras look at. A rotation around the
+    camera itself would move the image almost as a shift does, and Adam would learn both slowly. The part of the
+    corrections that moves, rotates or scales all cameras alike is removed. Images do not determine this part, and it
+    would move the model away from the held-out cameras.
 
     Args:
-        cameras: (V, 4, 4) given view matrices of the training views.
-        kinds: "camera" or a condition -> "pose", "offset" or "factor". A pose is a rotation vector and a shift in
-            camera axes. An offset is added to a position. For a factor, the logarithm is learned.
+        cameras: (V, 4, 4) given world-to-camera matrices of the training views.
+        kinds: "camera" or the name of a condition -> its correction, "pose", "offset" or "factor". A pose is a rotation
+            vector and a shift in camera axes. An offset is added to a position. For a factor, the logarithm is learned.
         unit: unit of shifts and offsets, in scene units.
     """
 
@@ -230,7 +246,10 @@ class ViewCorrections(_NumbersOfViews):
         self._alike_inverse = torch.linalg.pinv(self._alike)
 
     def step_at(self, progress: float, gradients: Mapping[int, list[float] | None]) -> None:
-        """Update the corrections of views by ``gradients``, keyed by view, when ``progress`` of the budget is used."""
+        """Take an Adam step on the corrections of some views at ``progress``, the used fraction of the budget.
+
+        In the first tenth of the budget, nothing changes. ``gradients`` maps a view's index to its gradient.
+        """
         if progress < _CORRECTION_START:
             return
         self.step(gradients, _CORRECTION_FINAL ** ((progress - _CORRECTION_START) / (1 - _CORRECTION_START)))
@@ -257,7 +276,10 @@ class ViewCorrections(_NumbersOfViews):
         return [len(_CORRECTION_RATES[kind]) for kind in self.kinds.values()]
 
     def _motion(self, part: Tensor, pivot: Tensor) -> Tensor:
-        """Return the (4, 4) rigid transform of a rotation vector, around ``pivot``, and a shift."""
+        """Return the (4, 4) rigid transform of a pose correction, in camera coordinates.
+
+        ``part`` (6,) is a rotation vector in radians, around ``pivot`` (3,), and a shift in units of ``self.unit``.
+        """
         (x, y, z), shift = part[:3], self.unit * part[3:]
         zero = torch.zeros_like(x)
         cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
@@ -266,7 +288,7 @@ class ViewCorrections(_NumbersOfViews):
         return torch.cat([top, top.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
 
     def summary(self) -> str:
-        """Return a log line: the root mean square over the views of each correction."""
+        """Return a log line with the size of each correction: its root mean square over the training views."""
         found = []
         for name, part in zip(self.kinds, self.numbers.split(self._sizes(), 1), strict=True):
             kind, sizes = self.kinds[name], part.square().unflatten(1, (-1, 3 if part.shape[1] > 1 else 1)).sum(-1)
@@ -279,10 +301,11 @@ class ViewCorrections(_NumbersOfViews):
 
 
 def _looked_at(rotations: Tensor, shifts: Tensor) -> Tensor:
-    """Return the (3,) point nearest to the optical axes of cameras with rotations (V, 3, 3) and shifts (V, 3).
+    """Return the (3,) point nearest to the optical axes of V cameras, which minimises the sum of squared distances.
 
-    It minimises the sum of squared distances. If the axes are almost parallel, within about 3 degrees, the point is as
-    near to the cameras as their other axes allow: a rotation around a far point would move the cameras far.
+    World-to-camera matrices have the rotations (V, 3, 3) and shifts (V, 3). If all axes are parallel within about 3
+    degrees, they do not determine the position along them. Then it is that of the mean camera centre, because a
+    rotation around a far point would move the cameras far.
     """
     sideways = rotations[:, :2].flatten(0, 1)  # (2 V, 3): a point on an axis has the camera coordinates (0, 0, z)
     middle = -(rotations.transpose(1, 2) @ shifts[..., None]).mean(0)[:, 0]

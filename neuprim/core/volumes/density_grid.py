@@ -1,5 +1,9 @@
-"""The model's extinction on a regular grid: sigma(x) = sum over primitives of (1 - |y|^2)^p max(0, f(x~)) / m inside
-their ellipsoids. A negative f is clamped to 0 at every point; a renderer clamps the integral of f along a ray instead.
+"""The model's extinction on a regular grid, in 1/scene unit.
+
+The extinction at x is sigma(x) = sum of (1 - |y|^2)^p max(0, f(x~)) / m over the primitives whose ellipsoid contains x.
+An ellipsoid has centre mu, longest semi-axis m and edge p (how density fades at its boundary). y is x in coordinates
+where the ellipsoid is the unit ball, x~ = (x - mu) / m, and f is the primitive's cosine network. A negative f is
+clamped to 0 at every point; a renderer clamps the integral of f along a ray instead.
 
 A neuron's phase is linear in the index along each axis. So its cosine at a grid point is the real part of a product of
 one complex number per axis. A primitive that spans n^3 points needs 3 n sines and cosines per neuron, and two
@@ -44,9 +48,10 @@ def box_lattice(bounds: np.ndarray | Tensor, resolution: int) -> tuple[Tensor, t
 
 
 def voxels_in_box(bounds: np.ndarray | Tensor, scene_from_index: np.ndarray) -> tuple[Tensor, tuple[int, int, int]]:
-    """Return matrix scene_from_index (4, 4) and shape of the part of a grid whose voxel centres lie in a box.
+    """Return the part of a grid whose voxel centres lie in a box, as a matrix scene_from_index (4, 4) and a shape.
 
-    ``bounds`` (2, 3) is the box, in scene units. For a rotated grid, the part is a block of voxels around the box.
+    ``scene_from_index`` is the matrix of the whole grid. ``bounds`` (2, 3) is the box, in scene units. For a rotated
+    grid, the part is a block of voxels around the box.
     """
     corners = np.stack(np.meshgrid(*np.asarray(bounds, np.float64).T, indexing="ij"), -1).reshape(-1, 3)
     back = np.linalg.inv(scene_from_index)
@@ -63,8 +68,8 @@ def density_grid(
 ) -> Tensor:
     """Return (X, Y, Z) float32 extinctions, 1/scene unit, at ``scene_from_index @ (i, j, k, 1)``; on the CPU.
 
-    A density that lowers to a :class:`~neuprim.core.model.fields.Cosine` runs in compiled code on all cores; any other
-    density is evaluated in blocks. Memory in addition to the grid is a few MB.
+    A density with the closed form :class:`~neuprim.core.model.fields.Cosine` runs in compiled code on all cores; any
+    other density is evaluated in blocks. Memory in addition to the grid is a few MB.
 
     Args:
         conditions: conditions of the frame, e.g. ``{"time": tensor(0.5)}``.
@@ -113,7 +118,10 @@ def density_at(model: Primitives, conditions: Conditions, points: Tensor) -> Ten
 def _add_to_density_grid(
     model: Primitives, conditions: Conditions, ellipsoids: Any, P: np.ndarray, Q: np.ndarray, grid: np.ndarray
 ) -> None:
-    """Add a density to ``grid`` in torch code, primitive by primitive in a fixed order: sums are reproducible."""
+    """Add the extinction of all primitives to ``grid``, by torch code and in a fixed order: sums are reproducible.
+
+    ``ellipsoids`` has centres, semi-axes and rotations. P (4, 4) maps grid indices to the scene, Q (4, 4) back.
+    """
     active = model.active(conditions, torch.float64)
     for n, (mean, scale, R) in enumerate(zip(*(x.detach().numpy() for x in ellipsoids), strict=True)):
         center = Q[:3, :3] @ mean + Q[:3, 3]
@@ -139,7 +147,10 @@ def _fill_density_planes(
     omega0: float, edge: int,
     grid: Any,
 ) -> None:  # fmt: skip
-    """Fill planes start:stop of ``grid``. P (3, 4) maps indices to the scene, Q (3, 4) back."""
+    """Add the extinction of all primitives (cosine networks) to planes start:stop of ``grid``.
+
+    P (3, 4) maps grid indices to the scene, Q (3, 4) back. ``edge`` is the exponent p of the fade (1 - |y|^2)^p.
+    """
     K = W1.shape[1]
     longest = max(grid.shape[1], grid.shape[2], stop - start)
     low, high, steps, y = np.empty(3, np.int64), np.empty(3, np.int64), np.empty((3, 3)), np.empty(3)

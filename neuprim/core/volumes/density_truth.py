@@ -65,7 +65,7 @@ class DensityGridPlacement:
     extents: Sequence[GridExtent] = ()
 
     def matches(self, other: DensityGridPlacement) -> bool:
-        """Return whether ``other`` describes the same frames, positions and values."""
+        """Return whether ``other`` has the same frame numbers, transform, grid and extinction per value."""
         keys = ("scene_from_world", "numbers", "sigma_per_unit", "grid", "exact")
         mine, theirs = self.to_json(), other.to_json()
         return all(mine[key] == theirs[key] for key in keys)
@@ -161,7 +161,7 @@ class DensityTruth(ABC):
 
 
 class VoxelLook(NamedTuple):
-    """What M voxels of a frame emit and scatter, linear light, per scene unit."""
+    """Emission and scattering of M voxels of a frame, in linear light per scene unit."""
 
     points: np.ndarray  # (M, 3) float64 centres, scene units
     emission: np.ndarray  # (M, 3) extinction times emitted radiance
@@ -178,7 +178,7 @@ class DensityGridSource(DensityTruth):
         """Return the (4, 4) float64 world_from_index of a frame's absorbing grid; None if the frame has none."""
 
     def look(self, frame: int) -> VoxelLook | None:
-        """Return what the voxels of a frame emit and scatter; None if it is unknown or the frame is empty."""
+        """Return the emission and scattering of a frame's voxels; None if they are unknown or the frame is empty."""
         return None
 
     @abstractmethod
@@ -194,7 +194,7 @@ class DensityGridSource(DensityTruth):
 
 
 class DensityComparison:
-    """Accumulate errors of a model's extinction against the truth, block by block, as float64 sums over grid points."""
+    """Errors of a model's extinction against the true one, added up block by block in float64."""
 
     def __init__(self) -> None:
         self.points = self.active = 0
@@ -262,7 +262,7 @@ def measure_density_errors(
 def split_density_grid_planes(
     scene_from_index: Tensor, shape: tuple[int, int, int]
 ) -> list[tuple[Tensor, tuple[int, int, int]]]:
-    """Split a grid into blocks of whole planes; return scene_from_index and shape of each block."""
+    """Split a grid into blocks of whole planes of equal x; return scene_from_index (4, 4) and shape of each block."""
     planes = max(1, _BLOCK_POINTS // max(1, shape[1] * shape[2]))
     parts = []
     for x in range(0, shape[0], planes):

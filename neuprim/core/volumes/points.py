@@ -1,8 +1,9 @@
 """A model's extinction and source radiance at scattered points of one frame, differentiable.
 
-The extinction is sigma(x) = sum over primitives of (1 - |y|^2)^p max(0, f(x~)) / m inside their ellipsoids. The source
-radiance is q(x) = sum of sigma_i(x) c_i; the colour of a ray is the integral of T q. c_i is the part of a primitive's
-colour that does not depend on direction. A density that lowers to a :class:`~neuprim.core.model.fields.Cosine` runs in
+The extinction at x is sigma(x), the sum of sigma_i(x) = (1 - |y|^2)^p max(0, f(x~)) / m over the primitives i whose
+ellipsoid contains x (symbols: :mod:`neuprim.core.volumes.density_grid`). The source radiance is q(x) = sum of
+sigma_i(x) c_i, where c_i is the part of a primitive's colour that does not depend on direction. The colour of a ray is
+the integral of transmittance times q. A density with the closed form :class:`~neuprim.core.model.fields.Cosine` runs in
 compiled code. For any other density, torch code evaluates each pair of point and primitive.
 """
 
@@ -29,7 +30,7 @@ class PointShares:
 
     Attributes:
         error: (M,) error at each point, in any measure.
-        weight, error_weight: (N,) sums over points of sigma_i, and of sigma_i x error.
+        weight, error_weight: (N,) sums over points of sigma_i, the extinction of primitive i, and of sigma_i x error.
     """
 
     def __init__(self, count: int, device: torch.device) -> None:
@@ -55,9 +56,9 @@ class PointValues(NamedTuple):
     components: dict[str, Tensor]
 
     def request_shares(self, error: Tensor) -> PointShares:
-        """Return the contribution of each primitive to ``error`` (M,), which gets no gradient.
+        """Return the object that will hold each primitive's contribution to ``error`` (M,), which gets no gradient.
 
-        The backward pass fills the result.
+        The backward pass fills it.
         """
         self.shares.error = error.detach()
         return self.shares
@@ -111,7 +112,9 @@ def weighted_extinctions_at(
     shares: PointShares | None = None,
     threads: int = 0,
 ) -> Tensor:
-    """Return (M, 1 + C) float32: sigma at ``points`` (M, 3), and sums of sigma_i times the rows of ``weights`` (N, C).
+    """Return (M, 1 + C) float32 at ``points`` (M, 3): the extinction, and its sums weighted by ``weights`` (N, C).
+
+    Column 0 is the sum of sigma_i, the extinction of primitive i. Column 1 + c is the sum of sigma_i x weights[i, c].
 
     Args:
         active: the N primitives of a frame.
@@ -136,7 +139,7 @@ def weighted_extinctions_at(
 def _point_values(
     values: Tensor, width: int, rows: Tensor | None, shares: PointShares, named: tuple[str, ...]
 ) -> PointValues:
-    """Split the columns of ``values`` into extinction, source (``width`` columns) and the ``named`` components."""
+    """Split the columns of ``values`` into extinction, source radiance (``width`` columns) and ``named`` components."""
     components = dict(zip(named, values[:, 1 + width :].unbind(1), strict=True))
     return PointValues(values[:, 0], values[:, 1 : 1 + width] if width else None, rows, shares, components)
 
@@ -147,7 +150,7 @@ def _point_values(
 def _torch_density_point_values(
     active: ActivePrimitives, form: LoweredDensity, cells: PointCells, weights: Tensor, shares: PointShares
 ) -> Tensor:
-    """Return what :class:`CosinePointValues` returns, for any density; sums run in a fixed order."""
+    """Return what :func:`weighted_extinctions_at` returns, by torch code for any density; sums run in a fixed order."""
     g = active.geometry
     with torch.no_grad():  # one synchronisation
         inputs = [g.means, g.scales, 1 / g.scales, g.rotations, *form.tensors().values()]
@@ -177,8 +180,11 @@ def _torch_density_point_values(
 
 
 def find_point_pairs(geometry: Geometry, cells: PointCells) -> tuple[Tensor, Tensor]:
-    """Return the P pairs of a point and a primitive that contains it: (P,) int64 rows of ``cells.points``, and of
-    primitives, primitive by primitive. Runs on the device of the geometry; synchronises three times."""
+    """Return the P pairs of a point and a primitive whose ellipsoid contains the point, primitive by primitive.
+
+    The pairs are two (P,) int64 tensors: rows of ``cells.points``, and rows (indices) of primitives. Runs on the device
+    of the geometry; synchronises three times.
+    """
     means, scales, axes = (x.detach().double() for x in (geometry.means, geometry.scales, geometry.rotations.double()))
     starts, low, counts, points = (
         device.copy_to_device(torch.from_numpy(x), means.device)
@@ -204,6 +210,6 @@ def find_point_pairs(geometry: Geometry, cells: PointCells) -> tuple[Tensor, Ten
 
 
 def _sum_density_point_rows(count: int, rows: Tensor, values: Tensor) -> Tensor:
-    """Return (count, ...) sums of ``values`` (P, ...) by ``rows`` (P,), in the order of P; differentiable."""
+    """Return (count, ...) sums: entry r adds up ``values`` (P, ...) where ``rows`` is r, in order; differentiable."""
     zeros = torch.zeros((count, *values.shape[1:]), dtype=values.dtype, device=values.device)
     return zeros.index_put((rows,), values, accumulate=True)

@@ -1,4 +1,4 @@
-"""CPU path of :mod:`neuprim.core.volumes.points`: points in cells, and compiled sums of cosine densities over them."""
+"""CPU path of :mod:`neuprim.core.volumes.points`: points sorted into cells, and compiled sums of cosine densities."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NOT_FINITE = "extinction at points: a product of finite parameters is not finite
 
 
 class PointCells(NamedTuple):
-    """Points sorted into a uniform grid.
+    """Points sorted into the cells of a uniform grid.
 
     Attributes:
         order: (M,) int64 indices of the given points, cell by cell.
@@ -55,8 +55,11 @@ def sort_points_into_cells(points: np.ndarray) -> PointCells:
 
 
 class CosinePointValues(torch.autograd.Function):
-    """Autograd function of (means, log_scales, quats, W1, b1, w2, b2, weights), each with one row per primitive. The
-    result is (M, 1 + C) float32 at M points: extinction, and its sums weighted by the C columns of ``weights``."""
+    """Autograd function for sums of cosine densities at M points; the result is (M, 1 + C) float32.
+
+    Column 0 is the extinction, the sum of sigma_i over primitives i; the C others are sums weighted by ``weights`` (N,
+    C). Arguments with a gradient: (means, log_scales, quats, W1, b1, w2, b2, weights), each with one row per primitive.
+    """
 
     @staticmethod
     def forward(
@@ -112,8 +115,11 @@ class CosinePointValues(torch.autograd.Function):
 
 @exact_kernel
 def _prepare_point_axes(start, stop, means, log_scales, quats, centers, A, m, reach):  # type: ignore[no-untyped-def]
-    """For primitives start:stop, fill ``centers`` (N, 3), the matrices A (N, 3, 3) from offsets to whitened space,
-    longest semi-axes m (N,), and ``reach`` (N, 3), half sides of boxes around them. Returns whether all are finite."""
+    """Fill ``centers``, ``A``, ``m`` and ``reach`` of primitives start:stop; return whether all numbers are finite.
+
+    The matrix A (N, 3, 3) maps an offset from the centre (N, 3) to whitened space, where the ellipsoid is the unit
+    ball. m (N,) is the longest semi-axis, ``reach`` (N, 3) has half the sides of the ellipsoid's axis-aligned box.
+    """
     R, s, total = np.empty((3, 3)), np.empty(3), 0.0
     for n in range(start, stop):
         fill_ellipsoid_rotation(quats[n], R)
@@ -132,9 +138,12 @@ def _prepare_point_axes(start, stop, means, log_scales, quats, centers, A, m, re
 
 @exact_kernel
 def _prepare_point_neurons(start, stop, W1, b1, w2, b2, colors, omega0, m, rate, phase, amplitude, offset, shown):  # type: ignore[no-untyped-def]
-    """Fill rate (N, K, 3), phase and amplitude (N, K), and offset (N,), so that the network's output f at x is given by
-    f/m = offset + sum of amplitude cos(phase + rate . (x - mu)), mu the centre. Copies ``colors`` to ``shown``, in
-    float64. Returns whether all are finite."""
+    """Fill the coefficients of the networks of primitives start:stop; return whether all numbers are finite.
+
+    The output f of a primitive's network at a point x is given by f/m = offset + sum over its K neurons of amplitude
+    cos(phase + rate . (x - mu)), with centre mu and longest semi-axis m. Shapes: rate (N, K, 3), phase and amplitude
+    (N, K), offset (N,). ``shown`` gets a float64 copy of ``colors``.
+    """
     total = 0.0
     for n in range(start, stop):
         for k in range(W1.shape[1]):
@@ -153,7 +162,11 @@ def _prepare_point_neurons(start, stop, W1, b1, w2, b2, colors, omega0, m, rate,
 
 @exact_kernel
 def _density_parameters_backward(start, stop, log_scales, quats, omega0, m, prims, pulled, gradients):  # type: ignore[no-untyped-def]
-    """Fill gradients of (log_scales, quats, W1, b1, w2, b2) from gradients of A, rate, phase, amplitude and offset."""
+    """Fill ``gradients`` of (log_scales, quats, W1, b1, w2, b2) from ``pulled``, the gradients of ``prims``.
+
+    ``prims`` has A, rate, phase, amplitude and offset, see :func:`_prepare_point_axes` and
+    :func:`_prepare_point_neurons`.
+    """
     A, rate, phase, amplitude, offset = prims
     p_A, p_rate, p_phase, p_amplitude, p_offset = pulled
     g_log_scales, g_quats, g_W1, g_b1, g_w2, g_b2 = gradients
@@ -186,7 +199,7 @@ def _density_parameters_backward(start, stop, log_scales, quats, omega0, m, prim
 
 @exact_kernel
 def _sort_density_points(points, low, step, counts, starts, order, placed):  # type: ignore[no-untyped-def]
-    """Sort points by cell with a counting sort: fill ``starts`` (pass zeros), ``order`` and the sorted ``placed``."""
+    """Sort points by cell (counting sort): fill ``starts`` (given as zeros), ``order`` and the sorted ``placed``."""
     cells = np.empty(points.shape[0], np.int64)
     for p in range(points.shape[0]):
         cell = 0
@@ -207,7 +220,7 @@ def _sort_density_points(points, low, step, counts, starts, order, placed):  # t
 
 @exact_kernel
 def _merge_density_point_sums(start, stop, parts, order, merged):  # type: ignore[no-untyped-def]
-    """Add up the P ``parts`` (P, M, W) in order, for sorted points start:stop; fill ``merged`` (M, W), unsorted."""
+    """Add up ``parts`` (P, M, W) for sorted points p in start:stop; write row order[p] of ``merged`` (M, W)."""
     for p in range(start, stop):
         for q in range(parts.shape[2]):
             total = 0.0
@@ -218,14 +231,17 @@ def _merge_density_point_sums(start, stop, parts, order, merged):  # type: ignor
 
 @inline
 def _density_point_cell_span(center, reach, low, step, count):  # type: ignore[no-untyped-def]
-    """Return the first and last cell of an axis that a box meets; without one, first is past the end or last -1."""
+    """Return the first and last grid cell, along one axis, that the interval ``center`` +- ``reach`` meets.
+
+    If the interval misses the grid, the first is ``count`` or the last is -1.
+    """
     first = int(np.floor(min(max((center - reach - low) / step, 0.0), float(count))))
     return first, int(np.floor(min(max((center + reach - low) / step, -1.0), float(count - 1))))
 
 
 @inline
 def _point_cells_of_primitive(cells, reach, means, n):  # type: ignore[no-untyped-def]
-    """Return the first and last cell along each axis that the box of primitive n meets."""
+    """Return the first and last cell along x, y and z, (x0, x1, y0, y1, z0, z1), that the box of primitive n meets."""
     low, step, counts = cells.low, cells.step, cells.counts
     x0, x1 = _density_point_cell_span(means[n, 0], reach[n, 0], low[0], step, counts[0])
     y0, y1 = _density_point_cell_span(means[n, 1], reach[n, 1], low[1], step, counts[1])
@@ -252,7 +268,9 @@ def _density_at_point_offset(rate, phase, amplitude, offset, n, dx, dy, dz):  # 
 
 @kernel
 def _add_density_point_values(start, stop, cells, reach, prims, edge, chunk, sums):  # type: ignore[no-untyped-def]
-    """Add sigma and sigma x weights of primitives start:stop to part ``start // chunk`` of ``sums`` (parts, M, 1 + C).
+    """Add extinctions of primitives start:stop at M points to part ``start // chunk`` of ``sums`` (parts, M, 1 + C).
+
+    Column 0 gets a primitive's extinction sigma, column 1 + c gets sigma times its weight c (``colors``).
 
     Args:
         reach, prims: filled by :func:`_prepare_point_axes` and :func:`_prepare_point_neurons`, for all primitives.
@@ -285,8 +303,10 @@ def _add_density_point_values(start, stop, cells, reach, prims, edge, chunk, sum
 
 @kernel
 def _density_point_values_backward(start, stop, cells, reach, prims, edge, pulled, error, gradients, shares):  # type: ignore[no-untyped-def]
-    """Fill the gradients of ``prims`` from ``pulled`` (M, 1 + C), the gradients of the sums. Also fill ``shares`` (N,
-    2), the sums of sigma and of sigma x error."""
+    """Fill the gradients of ``prims`` from ``pulled`` (M, 1 + C), the gradients of the sums at M points.
+
+    ``shares`` (N, 2) gets each primitive's sums over points of its extinction sigma and of sigma x ``error``.
+    """
     points, starts, counts = cells.points, cells.starts, cells.counts
     means, A, rate, phase, amplitude, offset, colors = prims
     g_means, g_A, g_rate, g_phase, g_amplitude, g_offset, g_colors = gradients

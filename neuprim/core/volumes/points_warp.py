@@ -2,8 +2,8 @@
 """GPU path of :mod:`neuprim.core.volumes.points`: sums of cosine densities at points, by Warp kernels in float64.
 
 A thread adds up part of the primitives at one point or, in the backward pass, part of the points of one primitive. The
-parts are summed in a fixed order, so reruns give the same bits. A few thousand points need no grid: comparing one with
-a box takes a few instructions.
+parts are summed in a fixed order, so reruns give the same bits. The points are not sorted into a grid: for a few
+thousand, a test of every point against every primitive's box takes only a few instructions each.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _MARGIN = 1 + 1e-12  # of the boxes around ellipsoids: rounding must not leave o
 
 
 def cosine_point_values(geometry: Geometry, form: Cosine, points: Tensor, weights: Tensor, shares: Any) -> Tensor:
-    """Return (M, 1 + C) float32 extinction and weighted extinctions at ``points`` (M, 3), without a wait for the GPU.
+    """Return (M, 1 + C) float32 extinction and weighted extinctions at ``points`` (M, 3), without waiting for the GPU.
 
     All values are NaN if a parameter is not finite. Differentiable except in the points; the backward pass fills
     ``shares``.
@@ -60,7 +60,7 @@ def _network_at(offset: wp.vec3d, n: int, rate: Vec3ds2d, phase: Doubles2d, ampl
 
 @wp.func
 def _fade(inner: wp.float64, edge: int):
-    """Return (1 - |y|^2)^p from ``inner`` = 1 - |y|^2 and ``edge`` = p."""
+    """Return (1 - |y|^2)^p, which fades density to the boundary; ``inner`` is 1 - |y|^2 and ``edge`` is p."""
     value = d(1.0)
     if edge > 0:
         value = inner
@@ -74,7 +74,10 @@ def _add_primitives(
     points: Vec3ds, reach: Vec3ds, edge: int, means: Vec3ds, A: Mat33ds, rate: Vec3ds2d, phase: Doubles2d,
     amplitude: Doubles2d, constant: Doubles, weights: Doubles2d, values: Doubles2d,
 ):  # fmt: skip
-    """Thread (part, at) adds sigma and sigma x ``weights`` of its primitives to row part x M + at, for M points."""
+    """Add sigma (extinction) and sigma x ``weights`` of some primitives at one of M points to ``values``.
+
+    Thread (part, at) takes point ``at`` and primitives part, part + 32, ..., and adds to row part x M + at.
+    """
     part, at = wp.tid()
     p = part * points.shape[0] + at
     for n in range(part, means.shape[0], _FORWARD_PARTS):
@@ -98,9 +101,10 @@ def _add_points(
     g_means: Vec3ds, g_A: Mat33ds, g_rate: Vec3ds2d, g_phase: Doubles2d, g_amplitude: Doubles2d,
     g_constant: Doubles, g_weights: Doubles2d, shares: Doubles2d,
 ):  # fmt: skip
-    """Thread (part, n) adds up gradients, given as zeros, and (sigma, sigma x error) of primitive n over its points.
+    """Add up the gradients of one of N primitives over some points, and its ``shares`` (sigma, sigma x error).
 
-    For N primitives, the sums are in row part x N + n. ``pulled`` is the gradient of the values.
+    Thread (part, n) takes primitive n and points part, part + 8, ..., and writes row part x N + n. The gradient arrays
+    are given as zeros. ``pulled`` is the gradient of the values.
     """
     part, n = wp.tid()
     row = part * means.shape[0] + n
@@ -148,7 +152,7 @@ _TYPES = (wp.vec3d, wp.mat33d, wp.vec3d, d, d, d, d)
 
 
 def _primitive_arrays(tensors: tuple[Tensor, ...]) -> list[Any]:
-    """Return (means, A, rate, phase, amplitude, offset, weights), or their gradients, as arrays of the kernels."""
+    """Return (means, A, rate, phase, amplitude, offset, weights) of primitives, or their gradients, as Warp arrays."""
     means, A, *rest = tensors
     return [array(x, kind) for x, kind in zip((means, A.view(-1, 9), *rest), _TYPES, strict=True)]
 

@@ -1,4 +1,4 @@
-"""Executors of a launcher's tasks: processes of this machine (concurrent.futures), a Ray cluster, or Slurm (submitit).
+"""Executors, which run tasks in processes of this machine (concurrent.futures), on Ray, or under Slurm (submitit).
 
 Every machine of a cluster needs neuprim, and access to the output directory under the same path.
 """
@@ -115,7 +115,7 @@ class ProcessExecutor:
         return future
 
     def result(self, future: Future[JobResult]) -> JobResult:
-        """Return the result of a finished task. Raises WorkerDied."""
+        """Return the result of a finished task. Raises WorkerDied if the worker process crashed or was killed."""
         pool = self._busy.pop(future)
         try:
             result = future.result()
@@ -317,4 +317,4 @@ EXECUTORS: dict[str, tuple[type[LaunchExecutor], str | None]] = {
     "ray": (RayExecutor, "ray"),
     "slurm": (SlurmExecutor, "submitit"),
 }
-"""Launcher -> its executor, and the package that it needs."""
+"""Name of a launcher -> class of its executor, and the package that the executor needs; None for no package."""

@@ -107,7 +107,7 @@ class JobStatus:
     attempt: int = 0
 
     def end(self, result: JobResult) -> JobStatus:
-        """Return the final status of a job that ended with this result."""
+        """Return the final status of the job, which ended with ``result``."""
         return replace(self, state=result.state, text=result.line, attempt=result.attempts - 1)
 
 
@@ -134,7 +134,7 @@ def perform_job(job: LaunchJob, attempt: int, events: Events) -> JobResult:
 
 
 class StatusListener:
-    """Listener that turns the events of a run into the status of its job, and calls ``on_status`` with it."""
+    """Function object that is called with a run's events, and calls ``on_status`` with the resulting job status."""
 
     def __init__(self, attempt: int = 0, on_status: Callable[[JobStatus], None] = lambda status: None) -> None:
         self.status, self._on_status = JobStatus("starting", attempt=attempt), on_status
@@ -158,7 +158,7 @@ class StatusListener:
 
 
 def write_status(file: Path, status: JobStatus) -> None:
-    """Replace a status file. Errors are ignored, because a run must not end when its status cannot be written."""
+    """Write a status to a file. Errors are ignored, because a run must not end when its status cannot be written."""
     staged = file.with_name(f".{file.name}.{os.getpid()}")
     try:
         staged.write_text(json.dumps(asdict(status)), encoding="utf-8")
@@ -211,7 +211,10 @@ class WorkerTask:
     attempt: int = 0
 
     def checkpoint(self) -> Any:
-        """Return a task that continues this one; submitit queues it after Slurm preempted the job or its time is up."""
+        """Return a submission that continues this task.
+
+        submitit calls this method when Slurm preempts the job or the job's time is up, and queues the submission.
+        """
         from submitit.helpers import DelayedSubmission
 
         return DelayedSubmission(replace(self, attempt=self.attempt + 1))
@@ -235,7 +238,10 @@ class WorkerTask:
 
 @contextmanager
 def _report_status(task: WorkerTask, listener: StatusListener) -> Iterator[None]:
-    """Run a thread that writes the task's status, and that interrupts the main thread when the stop file appears."""
+    """Context manager that runs a thread beside the task.
+
+    The thread writes the task's status to a file, and interrupts the main thread when the stop file appears.
+    """
     over, blocked = threading.Event(), _worker_blocks_interrupts()
 
     def watch() -> None:
@@ -316,8 +322,8 @@ def _worker_blocks_interrupts() -> bool:
 
 
 def start_worker_process(log: Path, variables: Mapping[str, str]) -> None:
-    """Prepare a new worker process: ignore the terminal's Ctrl-C (the launcher forwards it), write the output to a
-    file, and end when the launcher has ended."""
+    """Prepare a new worker process: ignore the terminal's Ctrl-C (the launcher forwards it), append the output to the
+    file ``log``, and end when the launcher has ended. ``variables`` are environment variables to set."""
     os.environ.update(variables)
     if hasattr(os, "setsid"):
         os.setsid()

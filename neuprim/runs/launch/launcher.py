@@ -32,17 +32,17 @@ LAUNCH_FOLDER = "launch"
 """Folder in a sweep's directory for status files during the work, and for logs of workers that printed something."""
 
 OnStatus = Callable[[int, JobStatus], None]
-"""Called with the number of a job and its status, whenever the status changes."""
+"""Function that is called with the index of a job and its status, whenever the status changes."""
 
 OnResult = Callable[[int, JobResult], None]
-"""Called with the number of a job and its result, before the final status of the job."""
+"""Function that is called with the index of a job and its result, before the final status of the job."""
 
 _INTERVAL = 0.1
 """Seconds between two checks of the running jobs."""
 
 
 def ignore_status(number: int, status: JobStatus) -> None:
-    """Ignore a job's status: the default of ``on_status``."""
+    """Do nothing: the default of ``on_status`` arguments, functions that are called with a job's new status."""
 
 
 def check_launcher(settings: LauncherSettings, jobs: int) -> None:
@@ -66,7 +66,7 @@ def check_launcher(settings: LauncherSettings, jobs: int) -> None:
 
 
 def use_launcher_threads_for_runs(settings: LauncherSettings) -> AbstractContextManager[None]:
-    """Context manager that limits this process to ``launcher.threads`` threads, if ``launcher=inline``."""
+    """Context manager that limits this process to ``launcher.threads`` threads, if it runs the jobs (``inline``)."""
     own = settings.name == "inline" and settings.threads is not None
     return limit_process_threads(settings.threads or 1) if own else nullcontext()
 
@@ -135,7 +135,7 @@ def _launch_inline(
 
 @dataclass
 class _JobLoop:
-    """Loop that submits jobs to an executor, follows their status, and collects their results."""
+    """Loop that submits jobs to an executor, follows their status, and collects results; see :func:`launch_jobs`."""
 
     executor: LaunchExecutor
     tasks: Sequence[WorkerTask]

@@ -7,8 +7,8 @@
     flames         burning fuel (scenes with fire)
     color          albedo of the smoke, vec3s, not multiplied by density (scenes with colours)
 
-Values are about 0 to 1. Voxels are cubes. The box is one world unit wide and deep, centred at x = y = 0, its ground at
-z = 0, z up. Each scene defines sources and forces over time, with smooth random turbulence.
+Values are about 0 to 1. Voxels are cubes. The simulation box is one world unit wide and deep, centred at x = y = 0. Its
+ground is at z = 0, and z is up. Each scene defines sources and forces over time, with smooth random turbulence.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ SOLVER_VERSION = 1
 """Part of the cache's key: raise it with every change to the solver, the scenes' sources or the files' layout."""
 
 THRESHOLD = 2e-3
-"""Values below are background: they are invisible, and files stay small."""
+"""Grid values below this limit are written as background. They are invisible, and files stay small."""
 
 Resolution = Annotated[int, Range(16, 192)]
-"""Cells across the box; advection counts cells in float32, which is exact up to 2^24."""
+"""Number of cells across the simulation box. The limit exists because float32 counts cells exactly only up to 2^24."""
 
 MAX_TIMESTEPS = 1000
 
 Axes = tuple[Tensor, Tensor, Tensor]
-"""World coordinates (X, 1, 1), (1, Y, 1), (1, 1, Z), which broadcast against fields."""
+"""World coordinates of cell centres: (X, 1, 1), (1, Y, 1), (1, 1, Z), which broadcast against (X, Y, Z) fields."""
 
 _PERIOD = 16  # lattice nodes per axis before the noise repeats
 
@@ -54,7 +54,8 @@ class TurbulenceNoise:
     """Value noise (random numbers on a lattice, smoothly interpolated) with mean 0 and unit variance at the nodes.
 
     The noise depends only on seed, channel, position and time, not on time steps or resolution. Channels are
-    independent. ``cells``: lattice cells per world unit. ``tempo``: new random fields per second.
+    independent. Methods take ``cells``, the lattice cells per world unit, and ``tempo``, the new random fields per
+    second.
     """
 
     def __init__(self, seed: int) -> None:
@@ -66,7 +67,10 @@ class TurbulenceNoise:
         return torch.from_numpy(numbers.astype(np.float32))
 
     def field(self, channel: int, axes: Axes, cells: float, tempo: float, time: float) -> Tensor:
-        """Return (X, Y, Z) noise of one channel at ``time``, seconds."""
+        """Return (X, Y, Z) noise of one channel at ``time``, seconds, on the grid of coordinates ``axes``.
+
+        ``cells``: lattice cells per world unit. ``tempo``: new random fields per second, blended in between.
+        """
         phase = max(time, 0.0) * tempo
         key = math.floor(phase)
         angle = (phase - key) * math.pi / 2
@@ -76,7 +80,7 @@ class TurbulenceNoise:
         return torch.matmul(x, planes).reshape(len(x), len(y), len(z))
 
     def fractal(self, channel: int, axes: Axes, cells: float, tempo: float, time: float, octaves: int = 3) -> Tensor:
-        """Sum octaves of :meth:`field`, each twice as fine, half as strong and 1.5 times as fast."""
+        """Return a sum of ``octaves`` of :meth:`field`; each is twice as fine, half as strong and 1.5 times as fast."""
         fields = (self.field(channel + 101 * k, axes, cells * 2**k, tempo * 1.5**k, time) for k in range(octaves))
         return torch.stack([field * 0.5**k for k, field in enumerate(fields)]).sum(0)
 
@@ -87,7 +91,7 @@ class TurbulenceNoise:
 
 
 def _smoke_lattice_weights(places: Tensor) -> Tensor:
-    """Return (n, _PERIOD) interpolation weights of lattice nodes; cubic, so that slopes are continuous."""
+    """Return the (n, _PERIOD) weights of lattice nodes at n ``places``, in cells. Cubic, so slopes are continuous."""
     lower = places.floor()
     part = places - lower
     part = part * part * (3 - 2 * part)
@@ -100,9 +104,9 @@ def _smoke_lattice_weights(places: Tensor) -> Tensor:
 
 
 class SmokeStage:
-    """Simulation box of a smoke scene: coordinates of cell centres, noise, and (X, Y, Z) ``fade``, 1/s.
+    """Simulation box of a smoke scene, with coordinates of cell centres (``axes``), noise, and ``fade``.
 
-    ``fade`` is the rate at which gas vanishes near the sides and the top, so that nothing is cut off there.
+    ``fade`` (X, Y, Z), 1/s, is the rate at which gas vanishes near the sides and the top, so that nothing is cut off.
     """
 
     def __init__(self, box: SmokeBox, seed: int) -> None:
@@ -129,9 +133,9 @@ class SmokeStage:
 
 @dataclass(frozen=True)
 class SmokeScene:
-    """A simulated smoke scene: number of frames, seconds per frame, grids to write, and gas properties.
+    """A simulated smoke scene: number of frames, seconds per frame, and the gas properties (``solver``).
 
-    The module's docstring describes the grids. ``forcing`` returns sources and forces at a time in seconds.
+    ``grids`` names the OpenVDB grids to write, e.g. "density". ``forcing`` returns the sources and forces at a time, s.
     """
 
     name: str
@@ -148,7 +152,7 @@ class SmokeScene:
 
 
 def _soft_smoke_source_edge(distance: Tensor, width: float) -> Tensor:
-    """Return a smooth step over ``width``: 1 well inside (negative distance), 0 outside."""
+    """Return a smooth step of the signed ``distance``: 1 inside (negative), 0 outside, over a range ``width``."""
     t = (0.5 - distance / width).clamp(0, 1)
     return t * t * (3 - 2 * t)
 
@@ -285,7 +289,7 @@ GROUND_EXPLOSION = SmokeScene(
 
 
 def _whirl_axis(height: Tensor, time: float) -> tuple[Tensor, Tensor]:
-    """Return x and y of the whirl's axis at each height; higher parts follow with a delay and move less."""
+    """Return x and y of the tornado's axis at each height; higher parts follow with a delay and move less."""
     late = time - 0.55 * height
     reach = 0.13 * torch.exp(-0.35 * height)
     return reach * torch.sin(1.5 * late + 0.4), reach * torch.sin(1.05 * late + 2.0)
@@ -428,7 +432,7 @@ def make_smoke_grids(state: GasState, scene: SmokeScene, box: SmokeBox) -> list[
 
 @contextmanager
 def _solve_smoke_on_one_thread() -> Iterator[None]:
-    """Run torch on one thread, since the solver uses its own threads and results must not depend on their number."""
+    """Context manager: run torch on one thread. Results then do not depend on the solver's own number of threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

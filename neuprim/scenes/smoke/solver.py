@@ -27,7 +27,7 @@ Faces = tuple[Tensor, Tensor, Tensor]
 Job = TypeVar("Job")
 
 _ENDS = ((True, True), (True, True), (False, True))
-"""Whether the lower and the upper end of each axis are open; the ground is solid."""
+"""Per axis x, y, z: whether gas can flow through the lower and the upper end of the box. Only the ground is solid."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,9 @@ class SmokeBox:
 
     @cached_property
     def _modes(self) -> tuple[tuple[Tensor, ...], Tensor]:
-        """Eigenvectors of each axis' second-difference matrix, and inverse eigenvalues of the Laplacian.
+        """Eigenvectors of the second-difference matrix of each axis, and inverse eigenvalues of the box's Laplacian.
 
-        The eigenvectors are the columns of (n, n) matrices. The inverse eigenvalues are (X, Y, Z).
+        The eigenvectors are the columns of three (n, n) matrices. The inverse eigenvalues are (X, Y, Z).
         """
         vectors, total = [], torch.zeros(self.shape, dtype=torch.float64)
         for axis, (count, (low, high)) in enumerate(zip(self.shape, _ENDS, strict=True)):
@@ -87,7 +87,7 @@ def flow_divergence(velocity: Faces, box: SmokeBox) -> Tensor:
 
 
 def project_velocity(velocity: Faces, box: SmokeBox) -> Faces:
-    """Return the divergence-free part of a flow: u - grad p with laplace p = div u, closed at the ground."""
+    """Return the divergence-free part of the flow u: u - grad p with laplace p = div u. No gas crosses the ground."""
     u, v, w = velocity
     w = w.clone()
     w[:, :, 0] = 0
@@ -98,13 +98,13 @@ def expansion_flow(source: Tensor, box: SmokeBox) -> Faces:
     """Return the irrotational flow with divergence ``source`` (X, Y, Z), 1/s, e.g. of heated gas that expands.
 
     The solver adds this flow for advection only. The stored velocity remains divergence-free, so that the expansion
-    ends with its cause.
+    ends when its cause ends.
     """
     return _subtract_gradient(box.air_at_rest(), -box.solve_pressure(source), box)
 
 
 def _subtract_gradient(velocity: Faces, pressure: Tensor, box: SmokeBox) -> Faces:
-    """Return velocity - grad pressure, in float32; faces of the ground keep their values."""
+    """Return velocity - grad pressure on the cell faces, float32. Faces on the ground keep their velocity."""
     parts = []
     for axis, (component, (low, high)) in enumerate(zip(velocity, _ENDS, strict=True)):
         first, last = pressure.narrow(axis, 0, 1), pressure.narrow(axis, -1, 1)
@@ -114,13 +114,13 @@ def _subtract_gradient(velocity: Faces, pressure: Tensor, box: SmokeBox) -> Face
 
 
 def _smoke_solver_flow_at_centres(velocity: Faces) -> Tensor:
-    """Interpolate velocity from faces to cell centres, (3, X, Y, Z): the mean of opposite faces."""
+    """Return the (3, X, Y, Z) velocity at cell centres: the mean of the values on the two opposite faces."""
     u, v, w = velocity
     return torch.stack([u[1:] + u[:-1], v[:, 1:] + v[:, :-1], w[:, :, 1:] + w[:, :, :-1]]).mul_(0.5)
 
 
 def _smoke_solver_flow_at_faces(centred: Tensor) -> Faces:
-    """Interpolate velocity from cell centres to faces: the mean of the cells on both sides, one at the box's ends."""
+    """Return velocity on the faces: the mean of the two adjacent cells of ``centred``, or the only one at an end."""
     parts = []
     for axis, field in enumerate(centred):
         first, last, count = field.narrow(axis, 0, 1), field.narrow(axis, -1, 1), field.shape[axis] - 1
@@ -146,7 +146,7 @@ class GasProperties:
         heat, soot, expansion: temperature, density and volume produced per unit of burnt fuel.
         smoothing: 0..1, share by which each step blends face velocities with the mean of adjacent cells' velocities.
         cfl: cells that gas may cross in one step; faster gas leads to more steps per frame.
-        most_steps: maximum number of steps per frame.
+        most_steps: maximum number of steps per frame, even if gas then crosses more than ``cfl`` cells.
     """
 
     buoyancy: float = 2.0
@@ -191,7 +191,7 @@ class GasState:
 
 
 class GasSource(NamedTuple):
-    """A region in which the gas approaches given values. Quantities that are None do not change.
+    """A region of the box in which the gas approaches given values. Quantities that are None do not change.
 
     Attributes:
         where: slices of the cells of the region.
@@ -318,7 +318,7 @@ def _gas_acceleration(
 
 
 def _central_difference(field: Tensor, axis: int, cell: float) -> Tensor:
-    """Return the central difference along one axis, zero in the first and last cell."""
+    """Return the central difference of ``field`` along one axis, per world unit; 0 in the first and last cell."""
     result = torch.zeros_like(field)
     count = field.shape[axis] - 2
     result.narrow(axis, 1, count).copy_((field.narrow(axis, 2, count) - field.narrow(axis, 0, count)) * (0.5 / cell))
@@ -359,10 +359,10 @@ _INVISIBLE = 1e-4  # values up to this are not corrected; most of a box holds no
 
 
 class _SmokeSolverStencil(NamedTuple):
-    """Trilinear interpolation stencils of N points in a table (X * Y * Z, C) of cell values.
+    """Stencils (eight cells and weights each) that interpolate a table of cell values (X * Y * Z, C) at N points.
 
-    With ``embedding_bag``, stencils are several times faster than ``grid_sample`` in three dimensions, and the result
-    is the same for any number of threads.
+    They are read with torch's ``embedding_bag``, which is several times faster than ``grid_sample`` in three
+    dimensions. The result is the same for any number of threads.
     """
 
     rows: Tensor  # (N, 8) int32, the cells around each point; the first is the lowest corner
@@ -407,8 +407,8 @@ def advect_field(fields: Tensor, velocity: Tensor, time: float, cell: float, blu
 
         q1 = A(q),   q2 = A^-1(q1),   q' = q1 + (q - q2) / 2,
 
-    limited to the range of the eight cells from which ``q1`` is interpolated, so that no new extremum appears. The
-    first ``blurred`` fields are not corrected, nor are cells in which all other fields are negligible.
+    where q' is limited to the range of the eight cells from which q1 is interpolated, so that no new extremum appears.
+    The first ``blurred`` fields are not corrected, nor are cells in which all other fields are negligible.
     """
     shape = (fields.shape[1], fields.shape[2], fields.shape[3])
     table, winds = (x.reshape(len(x), -1).T.contiguous() for x in (fields, velocity))
@@ -465,5 +465,5 @@ def _smoke_solver_cell_indices(shape: tuple[int, int, int]) -> tuple[Tensor, ...
 
 
 def _smoke_solver_stencil_offsets(shape: tuple[int, int, int]) -> list[int]:
-    """Return the offsets of a stencil's eight cells from its first cell, in rows of the table."""
+    """Return the row offsets of a stencil's eight cells from its first cell, in a table (X * Y * Z, C) of cells."""
     return [(a * shape[1] + b) * shape[2] + c for a in (0, 1) for b in (0, 1) for c in (0, 1)]

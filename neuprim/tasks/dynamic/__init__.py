@@ -116,7 +116,7 @@ def vdb_recording_of(dataset: Dataset) -> VolumeRecording | None:
     """Return the volume sequence from which a dataset's images were rendered; None if there is none.
 
     Raises:
-        DatasetFault: the dataset's ``extra`` is something else.
+        DatasetError: the dataset's ``extra`` is something else.
     """
     if dataset.extra is None:
         return None
@@ -126,7 +126,10 @@ def vdb_recording_of(dataset: Dataset) -> VolumeRecording | None:
 
 
 def matter_mask(dataset: Dataset, index: int) -> Tensor | None:
-    """Return (H, W) bool: pixels that matter covers in any frame of a test view's camera; None without volumes."""
+    """Return (H, W) bool: pixels that smoke or fire covers in at least one frame of a test view's camera.
+
+    The result is None for datasets without a volume sequence.
+    """
     recording = vdb_recording_of(dataset)
     return None if recording is None else recording.matter_mask(index)
 
@@ -141,7 +144,7 @@ def held_out_clips(dataset: Dataset) -> Sequence[Clip]:
 
 
 def compare_with_vdb_recording(dataset: Dataset, model: Primitives) -> dict[str, Any]:
-    """Return errors of a model against its dataset's .vdb files, and facts about both; empty without such files."""
+    """Return errors of a model's extinction against its dataset's .vdb files, and facts on both; {} without files."""
     recording = vdb_recording_of(dataset)
     if recording is None:
         return {}
@@ -161,8 +164,9 @@ def invisible_fraction_over_time(model: Primitives, times: Sequence[Tensor]) -> 
     """Return the fraction of primitives that are invisible: opacity below 1/255 along all three axes at all ``times``.
 
     Along axis j, with direction r_j and semi-axis s_j, the optical depth of the chord through the centre is I = (N_p
-    s_j/m) (b2 + sum_k w2_k cos(omega0 b1_k) B_p(omega0 W1_k . r_j s_j/m)). m is the largest semi-axis;
-    :mod:`neuprim.core.model.edge` defines N_p and B_p for the exponent p of the edge.
+    s_j/m) (b2 + sum_k w2_k cos(omega0 b1_k) B_p(omega0 W1_k . r_j s_j/m)). W1, b1, w2 and b2 are the primitive's
+    parameters at the time, m is the largest semi-axis. :mod:`neuprim.core.model.edge` defines N_p and B_p for the
+    exponent p of the edge (how density fades at the ellipsoid's boundary).
     """
     most_opaque = torch.zeros(model.count, dtype=torch.float64)
     density, params = model.density, {k: v.detach() for k, v in model.of(model.density).items()}

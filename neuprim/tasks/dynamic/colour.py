@@ -18,8 +18,8 @@ from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.tasks.dynamic.time_density import get_frame_time
 
 FREQUENCIES = {"periods": 2 * math.pi, "printed": 1.0}
-"""Angle of the first Fourier term at xi = 1. The paper prints i xi, a nearly rank-deficient basis on [0, 1] (condition
-5e13); whole periods are well conditioned (2e5)."""
+"""Setting -> frequency w of the first Fourier term, in radians per sequence. "printed" is the paper's, which makes the
+terms nearly linearly dependent (condition number 5e13). "periods" fits whole periods into the sequence (2e5)."""
 
 _TIME_TENSORS = ("time_poly", "time_cos", "time_sin")
 
@@ -31,9 +31,9 @@ class TimeHarmonics(ColourField):
     """SH colour whose lowest band changes in time: c = max(0, C0 S(xi) + higher bands + 1/2).
 
     S(xi) = S0 + sum_{i=1..n} a_i xi^i + sum_{i=1..l} (b_i cos(w i xi) + c_i sin(w i xi)) has 1 + n + 2 l parameters
-    per channel: S0, a_i, b_i and c_i. xi is the time, C0 is the constant SH of degree 0, n is ``powers``, l is
-    ``waves``, and ``frequencies`` chooses w, see :data:`FREQUENCIES`. The higher bands do not change in time. With
-    n = l = 4, three channels have 84 parameters at degree 3 and 39 at degree 0.
+    per channel: S0, a_i, b_i and c_i. xi is the time, 0..1 over the sequence. C0 is the constant SH of degree 0, n is
+    ``powers``, l is ``waves``, and ``frequencies`` chooses w, see :data:`FREQUENCIES`. The higher bands do not change
+    in time. With n = l = 4, three channels have 84 parameters at degree 3 and 39 at degree 0.
     """
 
     def __init__(
@@ -79,7 +79,10 @@ class TimeHarmonics(ColourField):
     def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[TimeHarmonics, dict[str, Tensor]]:
-        """Return a smaller field: a lower degree, or fewer terms in time, refitted to S(xi) by least squares."""
+        """Return a field of lower degree or with fewer terms in time, and its parameters.
+
+        Fewer terms in time are fitted to S(xi) of all terms by least squares.
+        """
         field = type(self)(**{**self.settings(), name: value})
         if name == "degree":
             return field, sh.truncate_sh_bands(params, "sh_rest", value)
@@ -100,7 +103,7 @@ class TimeHarmonics(ColourField):
         return field, {**others, **kept, "sh_dc": dc[:, 0].contiguous()}
 
     def _terms(self, xi: Tensor) -> dict[str, Tensor]:
-        """Return name of a coefficient tensor -> its basis functions of time at ``xi``, float64."""
+        """Return coefficient tensor -> float64 values of its basis (powers, cosines or sines) at the time ``xi``."""
         turn = FREQUENCIES[self.frequencies] * xi
         waves = turn * torch.arange(1, self.waves + 1, dtype=torch.float64, device=xi.device)
         powers = xi ** torch.arange(1, self.powers + 1, dtype=torch.float64, device=xi.device)
@@ -119,7 +122,10 @@ class TimeHarmonics(ColourField):
         return dc
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Return one prunable unit per channel and SH coefficient above degree 0, and one per term in time."""
+        """Return prunable units (parameters that pruning zeroes together).
+
+        There is one per channel and SH coefficient above degree 0, and one per term in time.
+        """
         terms = ((name, i) for name, count in self._term_counts() for i in range(count))
         units = (PrunableUnit(f"{name} {i + 1}", {name: (i,)}) for name, i in terms)
         return (*sh.prunable_sh_coefficients(self.degree, self.channels, "sh_rest"), *units)

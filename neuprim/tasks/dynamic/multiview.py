@@ -92,7 +92,10 @@ def load_moving_multiview(settings: Mapping[str, Any], context: SceneContext) ->
 def _read_timed_frames(
     options: MultiviewSettings, document: JsonReader, records: list[JsonReader], time_range: _TimeRange
 ) -> tuple[list[JsonReader], list[ImageFrame]]:
-    """Parse JSON records of frames; return the used records, and their frames with the condition "time", 0..1."""
+    """Parse JSON records of frames; return those that are used, and their frames with the condition "time", 0..1.
+
+    ``time_range`` has the times in the file that become 0 and 1.
+    """
     layout = TransformsLayout(
         keys=("time", "train_filenames", "val_filenames", "test_filenames", "ply_file_path"), masks=True
     )
@@ -109,7 +112,10 @@ def _read_timed_frames(
 
 
 def _time_range(records: Sequence[JsonReader], others: Sequence[Path], setting: str) -> _TimeRange:
-    """Return the times in the files that become 0 and 1. "auto" also reads ``others``, the files of further splits.
+    """Return (low, high): the times in the files that become 0 and 1.
+
+    ``setting`` is "LOW:HIGH", or "auto" for the lowest and highest time in ``records`` and in the files ``others`` of
+    further splits.
 
     Raises:
         DataError: a frame has no time, a time is not finite or out of range, or "auto" finds a single time.
@@ -194,11 +200,12 @@ _MIN_OPACITY = 0.1  # least opacity of matter; the edges of smoke are seldom mor
 def sample_moving_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
     """Return at most ``count`` distinct starting points of a moving scene.
 
-    Positions are in scene units, colours in the images' colour space. Points lie on visual hulls. Each hull is
-    computed for one moment, since a hull of all masks would carve away whatever moves. Each point has the "time" and
-    the colour of its hull's moment. If several cameras share each time, a moment is one time. If every image has its
-    own time, as in D-NeRF, a moment is a run of four successive images. If an object moves by less than its size during
-    a run, the hull contains the middle of the object. Runs overlap, so that other runs supply the rest.
+    Positions are in scene units, colours in the images' colour space. Points lie on visual hulls (the volumes that
+    several masks allow). Each hull is computed for one moment, since a hull of all masks would carve away whatever
+    moves. Each point has the "time" and the colour of its hull's moment. If several cameras share each time, a moment
+    is one time. If every image has its own time, as in D-NeRF, a moment is a run of four successive images. If an
+    object moves by less than its size during a run, the hull contains the middle of the object. Runs overlap, so that
+    other runs supply the rest.
 
     If the cameras do not look at a common target, points lie along rays. Without alpha, or if every image has its own
     time and all hulls are empty, points fill a box in front of the cameras at random times.
@@ -222,7 +229,10 @@ def sample_moving_points(views: ViewSet, count: int, generator: torch.Generator)
 
 
 def _moving_hull_points(views: ViewSet, times: Tensor, count: int, generator: torch.Generator) -> PointCloud | None:
-    """Return points on the hulls of all moments; None if every image has its own time and all hulls are empty."""
+    """Return starting points on the visual hulls of all moments (times, or runs of successive images).
+
+    The result is None if every image has its own time and all hulls are empty.
+    """
     moments, shared = _choose_moments(times)
     surfaces, owners, sides = [], [], []
     empty: EmptyHull | None = None
@@ -259,7 +269,10 @@ def _moving_hull_points(views: ViewSet, times: Tensor, count: int, generator: to
 
 
 def _choose_moments(times: Tensor) -> tuple[list[tuple[list[int], float]], bool]:
-    """Return at most _MAX_MOMENTS moments (views, time), sorted by time, and whether each moment is a single time."""
+    """Return at most 64 moments, (indices of views, time), sorted by time, and whether each moment is a single time.
+
+    ``times`` (V,) are those of the views. If cameras do not share times, a moment is a run of four successive views.
+    """
     values = times.tolist()
     sharing = Counter(values)
     shared = float(np.median(list(sharing.values()))) >= _MIN_SHARED
@@ -275,7 +288,10 @@ def _choose_moments(times: Tensor) -> tuple[list[tuple[list[int], float]], bool]
 
 
 def _draw_moving_point_per_cell(points: Tensor, side: float, generator: torch.Generator) -> Tensor:
-    """Return indices of one random point per cubic cell of edge ``side``, as static surfaces occur in all moments."""
+    """Return the indices of one random point per cubic cell of edge ``side``.
+
+    Static surfaces occur in the hulls of all moments; this selection removes the repetitions.
+    """
     shuffled = torch.randperm(len(points), generator=generator)
     cells = ((points[shuffled] - points.min(0).values) / side).floor().long().numpy()
     _, first = np.unique(cells, axis=0, return_index=True)

@@ -1,4 +1,4 @@
-"""Colour field of smoke and fire under a light that is a condition: :class:`ScatteringHarmonics`."""
+"""Colour field of smoke and fire under a light that is an input (condition) of the model: ScatteringHarmonics."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from neuprim.core.settings import RenderSettings
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 
 SHINES = "shines"
-"""Condition, 0 or 1: whether an image includes emission. Of several images to be summed, only one does."""
+"""Name of a condition, 0 or 1: whether an image includes emission. Of several images to be summed, only one does."""
 
 MOST_OCTAVES = 8
 
@@ -61,11 +61,11 @@ def light_smoke_by_environment(environment: Environment, count: int, facts: Mapp
 
 
 class ScatteringHarmonics(TimeHarmonics):
-    """Emission, the colour of :class:`TimeHarmonics`, plus scattering of one light: S max(0, a) E/typical.
+    """Colour field of emission (the colour of :class:`TimeHarmonics`) plus scattered light, S max(0, a) E/typical.
 
     a (C,) is a parameter of each primitive: albedo times the scattering fraction of the extinction times the isotropic
-    phase function 1/4 pi. S is the :func:`scattered_light` for the model's transmittance from the primitive's centre to
-    the light, without gradient (:func:`~neuprim.core.render.light.shade_volume_by_light`). E is the condition
+    phase function 1/(4 pi). S is the :func:`scattered_light` for the model's transmittance from the primitive's centre
+    to the light, without gradient (:func:`~neuprim.core.render.light.shade_volume_by_light`). E is the condition
     ``light_intensity``: the irradiance of the unoccluded light.
 
     Args:

@@ -1,13 +1,15 @@
-"""Density field of cosine neurons that change in time; at a fixed time it is a static cosine density.
+"""Density field whose cosine neurons change in time.
 
-The setting ``time`` names the time-dependent parts, joined by "+":
+At a fixed time, the density is that of :mod:`neuprim.core.model.cosine`: a network of K neurons with phases b1, output
+weights w2 and offset b2, in an ellipsoid with centre mu. The setting ``time`` names the time-dependent parts, joined by
+"+":
 
     phase    b1 + xi W_t                                        equation 13 of the paper; K parameters
     offset   b2 + sum_j p_j cos(pi j xi) + q_j sin(pi j xi)     j = 1..4; 8 parameters
     window   (w2, b2) (1 - u^2)^2, u = (xi - c)/tau, |u| < 1    active from c - tau to c + tau; 2 parameters
     motion   mu + v (xi - c) + a (xi - c)^2                     c of the window, else 1/2; 6 parameters
 
-xi is the time, 0..1 over the sequence. Primitives whose window does not contain xi are dropped from the frame before
+xi is the time, 0..1 over the sequence. Primitives whose window does not contain xi are removed from a frame before
 anything else is computed.
 
 A model joined from chunks of a sequence stores the chunk number of every primitive. Neighbouring chunks overlap in
@@ -56,7 +58,8 @@ _OFFSETS, _MOTION = ("offset_cos", "offset_sin"), ("velocity", "acceleration")
 _SHARE = "share_"
 
 ChunkOverlaps = tuple[tuple[float, float], ...]
-"""(from, to) time of each overlap of chunks, ascending; chunk k ends with overlap k."""
+"""(from, to) times of the overlaps of successive chunks (separately trained parts of a sequence), ascending. Chunk k
+ends with overlap k."""
 
 
 def get_frame_time(conditions: Conditions) -> Tensor:
@@ -67,7 +70,7 @@ def get_frame_time(conditions: Conditions) -> Tensor:
 
 
 def validate_time_chunk_overlaps(seams: Sequence[Sequence[float]]) -> ChunkOverlaps:
-    """Convert overlaps of time chunks to tuples; raises ValueError unless all times ascend."""
+    """Convert ``seams``, (from, to) times of chunk overlaps, to tuples; raise ValueError unless all times ascend."""
     try:
         overlaps = tuple((float(begin), float(end)) for begin, end in seams)
     except (TypeError, ValueError):
@@ -79,7 +82,9 @@ def validate_time_chunk_overlaps(seams: Sequence[Sequence[float]]) -> ChunkOverl
 
 
 def time_chunk_weights(chunk: Tensor, overlaps: ChunkOverlaps, xi: Tensor) -> Tensor:
-    """Return the weight 0..1 of each primitive at time ``xi``, by its time chunk; float64, shape of ``chunk``.
+    """Return the weight 0..1 of each primitive at time ``xi``; float64, shape of ``chunk``.
+
+    The weight is 1 during the primitive's time chunk, 0 outside, and changes linearly during overlaps of chunks.
 
     Args:
         chunk: each primitive's chunk, 0 to len(overlaps), any dtype; rounded, as compression may change it slightly.
@@ -243,7 +248,10 @@ class TimeDensity(DensityField):
         return field, {key: value for key, value in remaining.items() if key in kept}
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Return prunable units: neurons, offset, motion per axis. A window is not prunable: zeros do not remove it."""
+        """Return prunable units (parameters zeroed together): neurons, the offset, and motion per axis.
+
+        A window is not prunable, since zeros do not remove it.
+        """
         rates = ("W_t",) if "phase" in self.parts else ()
         units = [
             PrunableUnit(unit.name, {**unit.places, **dict.fromkeys(rates, unit.places["b1"])})
@@ -267,7 +275,10 @@ class TimeDensity(DensityField):
 
 
 def _advance_phase_in_time(b1: Tensor, W_t: Tensor, xi: Tensor, turn: float) -> Tensor:
-    """Return b1 + xi W_t modulo ``turn``, 2 pi/omega0; exact to float32 even for times far outside 0..1."""
+    """Return the neurons' phases at time ``xi``, b1 + xi W_t, modulo ``turn``, which is 2 pi/omega0.
+
+    The result is exact to float32 even for times far outside 0..1.
+    """
     phase = b1.double() + xi * W_t.double()
     return (phase - turn * torch.round(phase.detach() / turn)).to(b1)
 
@@ -277,16 +288,19 @@ def _zero_time_parameters(width: int) -> Any:
 
 
 def _initial_time_window_center(ctx: InitContext) -> Tensor:
-    """Return (N, 1) initial window centres: the times of the starting points or, without times, random ones."""
+    """Return the (N, 1) initial centres of windows (spans of time in which primitives are active).
+
+    They are the times of the starting points or, without times, uniformly random in 0..1.
+    """
     if "time" in ctx.conditions:
         return ctx.conditions["time"].float().reshape(-1, 1)
     return (ctx.uniform(1) + 1) / 2
 
 
 def _initial_log_time_window(ctx: InitContext) -> Tensor:
-    """Return (N, 1) logarithms of the initial half widths of windows.
+    """Return (N, 1) logarithms of the initial half widths of windows (spans of time in which primitives are active).
 
-    ``window_frames`` limits the widths in frames, since longer sequences contain more events, not longer events.
+    The setting ``window_frames`` limits half widths in frames: longer sequences contain more events, not longer ones.
     """
     half = ctx.number("window", 0.2, 0)
     if ctx.settings.get("window_frames") is not None and "time" in ctx.steps:
@@ -320,13 +334,16 @@ def _sequence_mean_times(like: Tensor) -> Tensor:
 
 
 def _time_window_factor(params: Params, xi: Tensor) -> Tensor:
-    """Return the (N, 1) factors of the windows at time ``xi``: (1 - u^2)^2, u as in the module, and 0 for |u| > 1."""
+    """Return (N, 1) window factors on density: (1 - u^2)^2, or 0 for |u| > 1; u = (xi - window centre)/half width."""
     u = (xi - params["window_center"].double()) / params["log_window"].double().exp()
     return (1 - u * u).clamp_min(0.0).square()
 
 
 def _time_weights(params: Params) -> list[tuple[Tensor, Tensor]]:
-    """Return pairs (time, (N, 1) weights) for means over time; the weights of a primitive add up to 1."""
+    """Return pairs (time, (N, 1) weights) for means over time, weighted by the windows if there are any.
+
+    The weights of a primitive add up to 1.
+    """
     times = _sequence_mean_times(params["b1"])
     if "window_center" not in params:
         even = torch.full_like(params["b2"].double(), 1.0 / _MEAN_TIMES)
@@ -385,7 +402,10 @@ WINDOW_EDGE = 2  # exponent of the window in time
 
 @exact_kernel
 def _rows_in_time_window_kernel(center, log_window, xi, rows):  # type: ignore[no-untyped-def]
-    """Write the indices of primitives whose window contains ``xi`` to the start of ``rows``; return their number."""
+    """Write the indices of primitives that are active at time ``xi`` to the start of ``rows``; return their number.
+
+    A primitive is active if its window contains ``xi``: |xi - center| < exp(log_window).
+    """
     found = 0
     for n in range(center.shape[0]):
         if abs(xi - np.float64(center[n, 0])) < np.exp(np.float64(log_window[n, 0])):
@@ -429,9 +449,10 @@ class _TimeWindow(torch.autograd.Function):
 
 
 def apply_time_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi: Tensor) -> tuple[Tensor, Tensor]:
-    """Multiply w2 (N, K) and b2 (N, 1) by (1 - u^2)^2, or 0 if |u| > 1; u = (xi - center)/exp(log_window).
+    """Return w2 (N, K) and b2 (N, 1), which scale the density, multiplied by the factor of a window in time.
 
-    ``center`` and ``log_window`` are (N, 1); all have one dtype. The time ``xi`` () gets no gradient.
+    The factor is (1 - u^2)^2, or 0 if |u| > 1, with u = (xi - center)/exp(log_window). ``center`` and ``log_window``
+    are (N, 1); all have one dtype. The time ``xi`` () gets no gradient.
     """
     if not device.on_numba(w2, b2, center, log_window):
         weight = edge_weight(((xi.to(b2.dtype) - center) / log_window.exp()).square(), WINDOW_EDGE)
@@ -468,9 +489,9 @@ class _MoveInTime(torch.autograd.Function):
 
 
 def move_means(means: Tensor, velocity: Tensor, acceleration: Tensor, center: Tensor, xi: Tensor) -> Tensor:
-    """Return (N, 3) means + velocity (xi - center) + acceleration (xi - center)^2.
+    """Return the (N, 3) centres at time ``xi``: means + velocity (xi - center) + acceleration (xi - center)^2.
 
-    ``center`` is (N, 1); all have one dtype. The time ``xi`` () gets no gradient.
+    ``center`` (N, 1) is the time at which a primitive is at ``means``; all have one dtype. ``xi`` () gets no gradient.
     """
     if not device.on_numba(means, velocity, acceleration, center):
         since = xi.to(velocity.dtype) - center

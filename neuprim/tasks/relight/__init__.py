@@ -1,8 +1,8 @@
-"""The task ``relight``: fit images under one point light each, render under any light.
+"""The task ``relight``: fit a model to images under one point light each, and render it under any light.
 
 Image values are linear light divided by the exposure; 1 is the brightest value of a display. Metrics clamp the values
 to 0..1, since a single highlight of 20 would dominate an image's error. Metrics with "linear_clamped" in the name
-compare the clamped values, those with "display" compare their sRGB values. FLIP needs ``neuprim[flip]``.
+compare the clamped values, those with "display" compare their sRGB values. The metric FLIP needs ``neuprim[flip]``.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def _build_relight_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[D
 
 
 def _load_relight_scene(function: str, settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Import the scene loaders on first use and call the loader ``function``."""
+    """Load a scene by ``function`` of :mod:`neuprim.tasks.relight.datasets`, which is imported on first use."""
     from neuprim.tasks.relight import datasets
 
     loader: Callable[..., Dataset] = getattr(datasets, function)
@@ -101,7 +101,7 @@ _MIN_ALPHA = 1.0 / 255.0  # least alpha of a pixel that shows matter
 
 
 def relight_matter_mask(dataset: Dataset, index: int) -> Tensor | None:
-    """Return an (H, W) bool mask of the covered pixels of a test view; None for images without alpha."""
+    """Return an (H, W) bool mask of a test view's pixels with alpha above 1/255; None for images without alpha."""
     alpha = dataset.test.pixels(index).alpha
     return None if alpha is None else alpha > _MIN_ALPHA
 
@@ -109,7 +109,12 @@ def relight_matter_mask(dataset: Dataset, index: int) -> Tensor | None:
 def relight_metrics(
     dataset: Dataset, index: int, rendered: Tensor, truth: Tensor, structure: bool = True
 ) -> dict[str, float]:
-    """Return metrics of a test image: :func:`relight_scores`, PSNR by test part (e.g. new light), errors per class."""
+    """Return metric name -> value for the image ``rendered`` (H, W, 3) of a test view; ``truth`` is the ground truth.
+
+    The metrics are those of :func:`relight_scores`. If the test split has parts, such as "new_light", the PSNR is
+    repeated under the name of the view's part. If pixels have classes, such as "cast_shadow", errors per class are
+    added.
+    """
     known, result = dataset_lighting(dataset), relight_scores(rendered, truth, structure)
     part = next((p for p in known.parts if dataset.test.view(index).name.startswith(p)), None)
     if part is not None:
@@ -120,7 +125,7 @@ def relight_metrics(
 
 
 def diagnose_lighting(dataset: Dataset, model: Primitives) -> dict[str, Any]:
-    """Return facts about a relighting run: exposure, falloff, baseline scores, and pixel classes in percent."""
+    """Return facts about a relighting run: exposure, falloff, baseline scores, shares of pixel classes in percent."""
     known = dataset_lighting(dataset)
     result: dict[str, Any] = {"exposure": dataset.exposure, "falloff": known.falloff}
     result["baselines"] = lighting_baseline_scores(dataset)
@@ -133,7 +138,10 @@ def diagnose_lighting(dataset: Dataset, model: Primitives) -> dict[str, Any]:
 
 
 def lighting_baseline_scores(dataset: Dataset) -> dict[str, dict[str, Any]]:
-    """Return baseline name -> mean test scores. Baselines use no model. SSIM and FLIP are left out: they are slow."""
+    """Return baseline name -> mean scores over the test views; a baseline is an image made without a model, e.g. black.
+
+    SSIM and FLIP are left out, because they are slow.
+    """
 
     found = {}
     for name, guess in {"black": None, **dataset_lighting(dataset).baselines}.items():
@@ -154,13 +162,16 @@ def relight_clips(dataset: Dataset) -> Sequence[Clip]:
 
 
 def light_facts(dataset: Dataset) -> dict[str, Any]:
-    """Return a summary of the training lights for the model's header."""
+    """Return the entry "lights" for the model's header: a summary of the training lights."""
     lights = torch.stack([dataset.train.view(i).conditions["light"] for i in range(len(dataset.train))])
     return {"lights": summarize_lights(lights, dataset.center, dataset_lighting(dataset).falloff, dataset.exposure)}
 
 
 def light_orbit(dataset: Dataset, frames: int) -> list[View]:
-    """Return views of an orbit. The light orbits the opposite way, at the training lights' mean distance and height."""
+    """Return ``frames`` views of a camera orbit, in which the light orbits in the opposite direction.
+
+    The light has the mean distance, mean elevation and mean intensity of the training lights.
+    """
     training = [dataset.train.view(i).conditions for i in range(len(dataset.train))]
     up, center = dataset.up.double() / dataset.up.double().norm(), dataset.center.double()
     offsets = torch.stack([c["light"] for c in training]).double() - center
@@ -182,7 +193,10 @@ def light_orbit(dataset: Dataset, frames: int) -> list[View]:
 
 
 def relight_scores(rendered: Tensor, truth: Tensor, structure: bool = True) -> dict[str, float]:
-    """Return the PSNR of linear values clamped to 0..1 and of display values; if ``structure``, also SSIM and FLIP."""
+    """Return scores of an image after clamping to 0..1: the PSNR in linear light and in sRGB ("display").
+
+    With ``structure``, the result also has SSIM and, if it is installed, FLIP, both of sRGB values.
+    """
     first, second = rendered.clamp(0.0, 1.0), truth.clamp(0.0, 1.0)
     result = {"psnr_linear_clamped": psnr(first, second)}
     first, second = linear_to_srgb(first), linear_to_srgb(second)
@@ -215,7 +229,7 @@ def relight_pixel_class_errors(rendered: Tensor, truth: Tensor, classes: Tensor)
 
 
 def relight_pixel_class_shares(maps: list[Tensor]) -> dict[str, float]:
-    """Return the frequency of each pixel class, in percent of the pixels that are not background."""
+    """Return pixel class -> percent of all pixels that are not background; ``maps`` are (H, W) class indices."""
     counts = torch.stack([torch.bincount(m.reshape(-1).long(), minlength=len(PIXEL_CLASSES)) for m in maps]).sum(0)
     whole = max(float(counts[1:].sum()), 1.0)
     return {name: 100.0 * float(counts[i]) / whole for i, name in enumerate(PIXEL_CLASSES) if i}

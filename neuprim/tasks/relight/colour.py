@@ -1,14 +1,15 @@
 """Colour fields under a point light: a network per primitive (equation 14 of the paper), or spherical harmonics.
 
-    h = cos(beta (W_x x~ + W_d d + W_l l + b))             x~ the local middle of the chord; d and l unit vectors at the
-                                                           centre: from the camera, and to the light
+    h = cos(beta (W_x x~ + W_d d + W_l l + b))
     additive         c = V E max(0, c_dc + W_out h)        equation 14: 9 -> H -> 3, 107 parameters at H = 8
-    multiplicative   c = V E max(0, albedo (1 + w_out . h))    no tinting: 91 parameters
+    multiplicative   c = V E max(0, albedo (1 + w_out . h))    h does not change the hue: 91 parameters
 
-E is the strength of the light relative to a typical training light: the intensity, divided by the squared distance if
-the dataset's falloff is "inverse_square". V is the visibility of the light from the primitive
-(:mod:`neuprim.core.render.light`), or 1. All terms but W_x x~ are constant over a primitive. The field is therefore
-lowered to :class:`~neuprim.core.model.forms.RayNet`, which the renderer evaluates per pixel.
+x~ is the middle of the ray's chord through the ellipsoid, relative to its centre, in units of its longest semi-axis. d
+and l are unit vectors: from the camera to the centre, and from the centre to the light. E is the strength of the light
+relative to a typical training light: the intensity, divided by the squared distance if the dataset's falloff is
+"inverse_square". V is the visibility of the light from the primitive (:mod:`neuprim.core.render.light`), or 1. All
+terms but W_x x~ are constant over a primitive. For each frame, the field is therefore converted to
+:class:`~neuprim.core.model.forms.RayNet`, which the renderer evaluates per pixel.
 """
 
 from __future__ import annotations
@@ -127,8 +128,11 @@ class LightNetwork(ColourField):
         return RayNet(self.boost * params["net_x"], self.boost * phase, out * factor[:, :, None], base * factor)
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
-        """Adapt the parameters to a split, so that children have the parent's colour. The local point x~ of a parent
-        (centre mu, size m) is x~' = x~ m/m' - (mu' - mu)/m' in a child (centre mu', size m')."""
+        """Return the parameters of children, which replace split parents, so that they keep the parents' colour.
+
+        A point at x~ in a parent (centre mu, longest semi-axis m) is at x~' = x~ m/m' - (mu' - mu)/m' in a child
+        (centre mu', longest semi-axis m').
+        """
         r = (new.log_length_scale.double() - old.log_length_scale.double()).exp()
         shift = (new.means.double() - old.means.double()) / old.length_scale.double()[:, None]
         net_x = params["net_x"].double()
@@ -212,7 +216,10 @@ def prune_light_network_units(
 
 
 class LightHarmonics(ColourField):
-    """Baseline colour field c = E max(0, SH(l)), without view dependence and shadows; E and l as in the module."""
+    """Baseline colour field c = E max(0, SH(l)), without view dependence and shadows.
+
+    SH is a sum of spherical harmonics, l the direction to the light, and E the light's strength (see the module).
+    """
 
     def __init__(self, degree: int = 5, channels: int = 3, falloff: bool = False, typical: float = 1.0) -> None:
         check_count(degree, 0, 8, "spherical-harmonics degree")
@@ -254,7 +261,7 @@ class LightHarmonics(ColourField):
 
 
 def real_light_harmonics(directions: Tensor, degree: int) -> Tensor:
-    """Evaluate orthonormal real spherical harmonics at unit directions (N, 3): (N, (degree + 1)^2).
+    """Return (N, (degree + 1)^2) orthonormal real spherical harmonics at unit ``directions`` (N, 3).
 
     Bands are in order, m = -l..l. Recurrences give the associated Legendre functions, without Condon-Shortley phase:
     P_m^m = (2m - 1)!! sin^m, P_{m+1}^m = (2m + 1) z P_m^m, (l - m) P_l^m = (2l - 1) z P_{l-1}^m -

@@ -1,4 +1,4 @@
-"""Load relighting data: one light at a time in the layout of GS³ and NRHints, and the generated ``lit_solids``.
+"""Load relighting data, one point light per image: the file layout of GS³ and NRHints, and built-in ``lit_solids``.
 
 Keys of ``transforms_SPLIT.json``:
 
@@ -82,7 +82,7 @@ class OlatSettings(FolderSettings):
 
 
 def load_olat(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load ``scene=olat`` from ``settings["path"]``; image values are linear light divided by the exposure."""
+    """Load ``scene=olat`` (one light at a time) from ``settings["path"]``; values are linear light over exposure."""
     options = validate_settings(OlatSettings, settings, "scene")
     folder = find_data_folder(options.path)
     train, test = read_image_splits(
@@ -107,7 +107,10 @@ def load_olat(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
 
 
 def read_olat_split(folder: Path, split: str, options: OlatSettings) -> list[ImageFrame]:
-    """Read the views of one split, with their lights as conditions; DataError for missing or wrong fields."""
+    """Read the views of one split with the conditions "light" (world coordinates) and "light_intensity".
+
+    Raises DataError for missing or wrong fields.
+    """
     document = JsonReader.open(folder / f"transforms_{split}.json")
     near = document.number_or("camera_near", 3.0, "a distance above 0", 0.0)
     if document.number_or("camera_far", max(10.0, 2.0 * near), f"a distance above camera_near, {near:g}") <= near:
@@ -142,7 +145,7 @@ def _olat_frame_name(record: JsonReader) -> str:
 
 
 def _find_olat_image(folder: Path, record: JsonReader) -> Path | None:
-    """Return the image file of an entry in ``frames``; None if it does not exist."""
+    """Return the image file that ``record``, an entry of ``frames`` in the JSON file, names; None if it is missing."""
     if record.has("img_path"):
         parts = record.text("img_path").replace("\\", "/").split("/")
         tails = (
@@ -168,7 +171,10 @@ def _existing_olat_file(path: Path) -> Path | None:
 
 
 def _olat_viewmat(record: JsonReader, ignore_corrections: bool) -> Tensor:
-    """Return the (4, 4) float64 world-to-camera matrix of an entry in ``frames``, OpenCV axes."""
+    """Return the (4, 4) float64 world-to-camera matrix, OpenCV axes, of ``record``, a JSON entry in ``frames``.
+
+    The optimised pose (R_opt, T_opt) is used if it exists and is not ignored, else ``transform_matrix``.
+    """
     corrected = record.has("R_opt") or record.has("T_opt")
     if not corrected or ignore_corrections:
         if corrected and not record.has("transform_matrix"):
@@ -183,7 +189,7 @@ def _olat_viewmat(record: JsonReader, ignore_corrections: bool) -> Tensor:
 
 
 def _light_intensity(source: JsonReader) -> Tensor:
-    """Return ``pl_intensity`` as (3,) float32; ones if it is missing."""
+    """Return the light's RGB intensity, the JSON value ``pl_intensity``, as (3,) float32; ones if it is missing."""
     expected = "3 numbers of at least 0, or one"
     if not source.has("pl_intensity"):
         return torch.ones(3)
@@ -210,7 +216,7 @@ class LitSolidsSettings(LitSettings):
 
 
 def load_lit_solids_for_relighting(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load ``scene=lit_solids``. The first use renders images to ``context.cache_dir``; later uses read them."""
+    """Load the scene ``lit_solids``. The first use renders images to ``context.cache_dir``; later uses read them."""
     options = validate_settings(LitSolidsSettings, settings, "scene")
     drawn = LitSettings(**{f.name: getattr(options, f.name) for f in fields(LitSettings)})
     folder = generate_lit_solids(drawn, context.cache_dir, context.progress)
@@ -229,7 +235,10 @@ def load_lit_solids_for_relighting(settings: Mapping[str, Any], context: SceneCo
 
 
 def _lit_solids_olat_lighting(dataset: Dataset, folder: Path) -> Lighting:
-    """Return facts about ``lit_solids``: pixel classes, test parts, two baselines, a clip with a circling light."""
+    """Return the :class:`Lighting` of ``lit_solids``: functions that read pixel classes and two baseline images.
+
+    It also has the names of the parts of the test split, and a video clip in which the light circles.
+    """
     names = {"no_cast_shadows": "unshadowed.exr", f"nearest_light_of_{NEAR_LIGHTS}": "nearest.exr"}
     baselines = {name: partial(_read_lit_companion_image, ending) for name, ending in names.items()}
     views = read_olat_split(folder, "circle", OlatSettings(path=folder))
@@ -249,9 +258,10 @@ def read_lit_pixel_classes(views: ViewSet, index: int) -> Tensor:
 
 
 def _read_lit_companion_image(ending: str, views: ViewSet, index: int) -> Tensor | None:
-    """Read the (H, W, 3) image of a view whose file name ends with ``ending``; None if the view has none.
+    """Read a further (H, W, 3) image of a view, from its file VIEW_``ending``; None if the view has none.
 
-    Values are linear light divided by the exposure. Training views have no image "nearest".
+    ``ending`` is "unshadowed.exr" or "nearest.exr", which training views do not have. Values are linear light divided
+    by the exposure.
     """
     camera, path = views.view(index).camera, _lit_companion_path(views, ending, index)
     return read_image(path, (camera.width, camera.height))[..., :3].float() if path.is_file() else None

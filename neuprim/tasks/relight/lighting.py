@@ -1,6 +1,7 @@
-"""Properties of the lights of a relighting dataset: falloff, exposure, baselines.
+"""Properties of a relighting dataset: falloff of the light with distance, exposure, baseline images.
 
-Every view has two conditions: "light" (3,), position in scene units, and "light_intensity" (3,), radiant intensity.
+Every view has two conditions (inputs of the model besides the camera): "light" (3,), the light's position in scene
+units, and "light_intensity" (3,), its RGB radiant intensity.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ FALLOFF_SPREAD = 0.4  # largest standard error of a measured falloff exponent
 
 @dataclass(frozen=True)
 class Lighting:
-    """Optional facts about a relighting dataset besides images, cameras and lights; stored as its ``extra``."""
+    """Optional facts about a relighting dataset besides images, cameras and lights; stored in ``Dataset.extra``."""
 
     # "inverse_square" if images darken with the square of the light's distance, so that a renderer divides by it;
     # "none" if intensities are given as they arrive, or unknown
@@ -47,12 +48,15 @@ class Lighting:
 
 
 def dataset_lighting(dataset: Dataset) -> Lighting:
-    """Return the dataset's :class:`Lighting`, or the defaults; DatasetFault if ``extra`` is something else."""
+    """Return ``dataset.extra``, or a default :class:`Lighting` if it is None; DatasetError if it has another type."""
     return get_extra(dataset, Lighting) or Lighting()
 
 
 def olat_percentile_exposure(views: ImageViews, where: str) -> float:
-    """Return the exposure of images: the 99.5th percentile of premultiplied values; DataError if it is 0."""
+    """Return the exposure, by which images are divided: the 99.5th percentile of their premultiplied values.
+
+    Raises DataError if the percentile is 0; ``where`` names the data in the message.
+    """
     # counts per bit pattern, as patterns of non-negative half floats ascend with their values
     counts = torch.zeros(1 << 15, dtype=torch.int64)
     for i in range(len(views)):
@@ -71,12 +75,12 @@ def olat_percentile_exposure(views: ImageViews, where: str) -> float:
 
 
 def measure_falloff(dataset: Dataset) -> Falloff:
-    """Return "inverse_square" if images darken with the light's distance, else "none"; warn if the images do not tell.
+    """Return "inverse_square" if training images darken with the light's distance, else "none".
 
     The function fits log(mean value of a view / light intensity) by a linear combination of the logarithm of the
     light's distance, harmonics up to degree 2 of the directions to light and camera, and the cosine between these
-    directions and its square. If the coefficient of the distance is below -1 or cannot be determined, the result is
-    "inverse_square", as for a point light.
+    directions and its square. If the coefficient of the distance is at most -1, the result is "inverse_square", as for
+    a point light. If the images do not determine the coefficient, the result is the same, with a warning.
     """
     center, views = dataset.center.double(), dataset.train
     rows, values = [], []

@@ -6,8 +6,8 @@ n, l and v are unit vectors: the normal, and the directions from the primitive's
 h = unit(l + v) is the half vector. s(x) = (x + sqrt(x^2 + 0.01))/2 is a smooth max(0, x), gate(x) = 1/(1 + exp(-20 x)).
 a is the albedo. The sum over j is over highlight lobes with colours k_j and sharpnesses g_j: spherical Gaussians in the
 half vector (Wang et al. 2009, All-frequency rendering of dynamic, spatially-varying reflectance). b_0 + B l is indirect
-light. V is the visibility of the light. E is the light's strength, as for
-:class:`~neuprim.tasks.relight.colour.LightNetwork`. The colour is constant over a primitive.
+light, with one b_0 and one row of B per channel. V is the visibility of the light, 0..1. E is the light's strength
+relative to a typical training light (:mod:`neuprim.tasks.relight.colour`). The colour is constant over a primitive.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from neuprim.tasks.relight.colour import check_count
 from neuprim.tasks.relight.surface_constants import GATE, SHORTEST, WRAP
 
 INDIRECT = (0, 1, 4)
-"""Possible numbers of coefficients of indirect light per channel: none, b_0, or b_0 and B."""
+"""Possible numbers of coefficients of indirect light per channel: none, b_0, or b_0 and B (see the module)."""
 
 _GLOSS = 20.0  # initial sharpness of the first lobe; each further one is six times as sharp
 _HIGHLIGHT, _INDIRECT = 0.1, 0.02
@@ -52,15 +52,16 @@ def surface_colors(
     light: Tensor,
     eye: Tensor,
 ) -> Tensor:
-    """Return (N, 2, C) linear colours of N primitives, direct and indirect: the module's equation for E = V = 1.
+    """Return (N, 2, C) linear colours of N primitives under a point light: [:, 0] is direct, [:, 1] indirect light.
 
-    Float32 tensors are computed by fused kernels. Differentiable with respect to all inputs but ``sizes``.
+    The colours follow the module's equation for E = V = 1. Float32 tensors are computed by fused kernels. The result is
+    differentiable with respect to all inputs but ``sizes``.
 
     Args:
         means: (N, 3) centres, scene units.
         sizes: (N,) sizes of the primitives, scene units.
         normal: (N, 3), of any length. albedo: (N, C).
-        highlight: (N, L, C) colours of lobes, L from 0 to 8. log_gloss: (N, L) natural logarithms of g.
+        highlight: (N, L, C) colours of lobes, L from 0 to 8. log_gloss: (N, L) natural logarithms of their sharpness g.
         indirect: (N, n, C), n one of :data:`INDIRECT`: b_0, then the columns of B for x, y and z.
         light, eye: (3,) positions, scene units.
 
@@ -132,7 +133,9 @@ def initial_normals(context: InitContext) -> Tensor:
 
 
 class SurfaceColour(ColourField):
-    """Colour field of a surface under a point light (see the module); 6 + 4 L + 3 n parameters for three channels.
+    """Colour field of surface primitives under a point light (see the module).
+
+    A primitive has 6 + 4 L + 3 n parameters for three channels.
 
     Args:
         lobes: L, number of highlight lobes, 0..8.
@@ -205,7 +208,7 @@ class SurfaceColour(ColourField):
     def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[SurfaceColour, dict[str, Tensor]]:
-        """Return a smaller colour field: fewer coefficients of indirect light, or fewer lobes.
+        """Return a colour field with fewer coefficients of indirect light or fewer lobes, and its parameters.
 
         The lobes with the largest product of colour and integral over the sphere remain.
         """
@@ -224,7 +227,7 @@ class SurfaceColour(ColourField):
         return field, found
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Return one prunable unit per lobe, and one for the directional part of indirect light."""
+        """Return prunable units (parameters zeroed together): one per lobe, one for indirect light's direction part."""
         found = [PrunableUnit(f"lobe {j}", {"highlight": (j,), "log_gloss": (j,)}) for j in range(self.lobes)]
         if self.indirect > 1:
             found.append(PrunableUnit("direction of indirect light", {"indirect": (slice(1, None),)}))

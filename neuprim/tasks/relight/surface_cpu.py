@@ -33,7 +33,10 @@ def _unit(x, y, z, shortest):  # type: ignore[no-untyped-def]
 
 @strict
 def _project_gradient(g, i, unit):  # type: ignore[no-untyped-def]
-    """Convert row i of ``g`` in place: from the gradient of :func:`_unit`'s output to that of its input."""
+    """Replace the gradient for a normalised vector by the gradient for the vector, in row i of ``g``.
+
+    ``unit`` is the result of :func:`_unit` for the vector.
+    """
     x, y, z, over, whole = unit
     along = (g[i, 0] * x + g[i, 1] * y + g[i, 2] * z) * whole
     g[i, 0], g[i, 1], g[i, 2] = (g[i, 0] - along * x) * over, (g[i, 1] - along * y) * over, (g[i, 2] - along * z) * over
@@ -41,7 +44,10 @@ def _project_gradient(g, i, unit):  # type: ignore[no-untyped-def]
 
 @strict
 def _directions(i, means, sizes, normal, light, eye):  # type: ignore[no-untyped-def]
-    """Return the normal, the directions to light and camera, and the half vector of primitive i, by :func:`_unit`."""
+    """Return four unit vectors of primitive i, each as :func:`_unit` returns it.
+
+    They are its normal, the directions to the light and to the camera, and the half vector of these directions.
+    """
     shortest = SHORTEST * np.float64(sizes[i])
     n = _unit(np.float64(normal[i, 0]), np.float64(normal[i, 1]), np.float64(normal[i, 2]), SHORTEST)
     l = _unit(light[0] - means[i, 0], light[1] - means[i, 1], light[2] - means[i, 2], shortest)
@@ -85,7 +91,10 @@ def _surface_colors_backward(  # type: ignore[no-untyped-def]
     start, stop, means, sizes, normal, albedo, highlight, log_gloss, indirect, light, eye, grad,
     g_light, g_eye, g_normal, g_albedo, g_highlight, g_log_gloss, g_indirect,
 ):  # fmt: skip
-    """Write all gradients ``g_...``; ``g_light`` and ``g_eye`` (N, 3) are of the vectors to light and camera."""
+    """Write the gradients ``g_...`` of primitives start to stop, from ``grad`` (N, 2, C), the gradient of the colours.
+
+    ``g_light`` and ``g_eye`` (N, 3) are for the vectors from each primitive to the light and to the camera.
+    """
     lobes, numbers, channels = log_gloss.shape[1], indirect.shape[1], albedo.shape[1]
     g_l = np.empty(3)
     for i in range(start, stop):

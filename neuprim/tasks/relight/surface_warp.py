@@ -18,7 +18,7 @@ _WRAP, _GATE, _SHORTEST, _LIMIT = (wp.constant(d(x)) for x in (WRAP, GATE, SHORT
 
 @wp.func
 def _over(v: wp.vec3d, shortest: wp.float64):
-    """Return 1 / max(length of v, ``shortest``)."""
+    """Return the factor 1 / max(length of v, ``shortest``), which normalises ``v``."""
     length = wp.length(v)
     if not length >= shortest:
         length = shortest
@@ -27,7 +27,10 @@ def _over(v: wp.vec3d, shortest: wp.float64):
 
 @wp.func
 def _pull_back(g: wp.vec3d, v: wp.vec3d, over: wp.float64, shortest: wp.float64):
-    """Return the gradient of ``v``; ``g`` is that of ``over`` times ``v``, where ``over`` is :func:`_over` of ``v``."""
+    """Return the gradient with respect to ``v``, from the gradient ``g`` with respect to the unit vector ``over`` v.
+
+    ``over`` is the result of :func:`_over` for ``v`` and ``shortest``.
+    """
     if not wp.length(v) >= shortest:
         return over * g
     unit = over * v
@@ -161,9 +164,10 @@ class _SurfaceColors(torch.autograd.Function):
 
 
 def fused_surface_colors(*tensors: Tensor) -> Tensor:
-    """Compute :func:`~neuprim.tasks.relight.surface.surface_colors` of float32 GPU tensors; differentiable.
+    """Compute :func:`~neuprim.tasks.relight.surface.surface_colors` on the GPU; differentiable.
 
-    The tensors must have at least one lobe and one coefficient of indirect light.
+    The arguments are those of that function, in its order; all but light and eye are float32 CUDA tensors. There must
+    be at least one lobe and one coefficient of indirect light.
     """
     result: Tensor = _SurfaceColors.apply(*tensors)
     return result

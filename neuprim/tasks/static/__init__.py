@@ -67,13 +67,13 @@ def _tunable_static_settings(model: Mapping[str, Any]) -> dict[str, tuple[int, .
 
 
 def _load_static_scene(module: str, function: str, settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Import a scene loader on first use and call it; each loader needs a library of its own."""
+    """Load a scene by ``function`` of the submodule ``module``, imported only now: it may need an optional library."""
     loader: Callable[..., Dataset] = getattr(import_module(f"neuprim.tasks.static.{module}"), function)
     return loader(settings, context)
 
 
 def _static_dataset_facts(dataset: Dataset) -> Mapping[str, Any]:
-    """Return file name and ``scene_from_file`` of ``scene=mesh`` for the model's header; empty for other data."""
+    """Return facts about ``scene=mesh`` for a model's header: file name, ``scene_from_file`` matrix; else empty."""
     return dataset.extra if isinstance(dataset.extra, dict) else {}
 
 

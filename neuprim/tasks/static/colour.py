@@ -63,7 +63,7 @@ class SphericalHarmonics(ColourField):
         return params["sh_dc"], params.get("sh_rest")
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Return one prunable unit per channel and SH coefficient above degree 0."""
+        """Return one prunable unit (parameters zeroed together) per channel and SH coefficient above degree 0."""
         return sh.prunable_sh_coefficients(self.degree, self.channels, "sh_rest")
 
     def script(self) -> str:
@@ -114,7 +114,7 @@ class SphericalLobes(ColourField):
         return SphericalLobes(value, self.channels), lobes.reduce_lobes(params, value)
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Return one prunable unit per lobe."""
+        """Return one prunable unit (parameters that pruning zeroes together) per lobe."""
         names = (AMPLITUDE, AXIS, LOG_SHARPNESS)
         return tuple(PrunableUnit(f"lobe {j}", dict.fromkeys(names, (j,))) for j in range(self.lobes))
 

@@ -127,7 +127,10 @@ class ColmapSettings(FolderSettings):
 
 
 def load_colmap(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load ``scene=colmap``, a COLMAP project with points. Undistorts photographs and masks pixels outside them."""
+    """Load ``scene=colmap``, a COLMAP project with its points. Photographs are undistorted.
+
+    Pixels that lie outside a photograph after undistortion are masked.
+    """
     asked = validate_settings(ColmapSettings, settings, "scene")
     folder = find_data_folder(asked.path)
     model = folder / asked.model
@@ -243,13 +246,13 @@ def _read_colmap_dataset_points(reconstruction: Any, model: Path) -> PointCloud 
 
 
 def load_solids_dataset(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load ``scene=solids``. The first use renders the images to ``context.cache_dir``; later uses read them."""
+    """Load the built-in scene ``solids``. The first use renders images to ``context.cache_dir``; others read them."""
     folder = generate_solids(validate_settings(SolidsSettings, settings, "scene"), context.cache_dir, context.progress)
     return replace(load_blender({"path": str(folder)}, context), name="solids", data_source="generated")
 
 
 def load_room_dataset(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load ``scene=room``. The first use renders the images to ``context.cache_dir``; later uses read them."""
+    """Load the built-in scene ``room``. The first use renders images to ``context.cache_dir``; others read them."""
     folder = generate_room(validate_settings(RoomSettings, settings, "scene"), context.cache_dir, context.progress)
     dataset = load_nerfstudio({"path": str(folder)}, context)
     return replace(dataset, name="room", data_source="generated", up=torch.tensor([0.0, 0.0, 1.0]))

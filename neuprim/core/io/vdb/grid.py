@@ -245,7 +245,7 @@ class VdbGrid:
 
 
 def _vdb_leaf_blocks(padded: np.ndarray) -> np.ndarray:
-    """Return the (X/8, Y/8, Z/8, 8, 8, 8, …) view of an (X, Y, Z, …) array whose edges are multiples of 8."""
+    """View an (X, Y, Z, …) array, edges multiples of 8, as blocks of 8 x 8 x 8 voxels: (X/8, Y/8, Z/8, 8, 8, 8, …)."""
     x, y, z = (n // 8 for n in padded.shape[:3])
     split = padded.reshape(x, 8, y, 8, z, 8, *padded.shape[3:])
     return split.transpose(0, 2, 4, 1, 3, 5, *range(6, split.ndim))

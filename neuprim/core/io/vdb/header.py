@@ -29,7 +29,7 @@ class VdbCursor:
         self.end = len(data) if end is None else end
 
     def fail(self, text: str) -> DataError:
-        """Return the DataError to raise for invalid data at or before this position."""
+        """Return (do not raise) a DataError with the message ``text``, which names the file."""
         return DataError(f"{self.path}: {text}")
 
     def need(self, count: int, what: str) -> None:
@@ -93,7 +93,10 @@ def blosc_module() -> Any:
 
 
 def vdb_decompressor(flags: int) -> Callable[[bytes, int], bytes]:
-    """Return a function (chunk, size) -> bytes, which decompresses data of a grid or raises ValueError."""
+    """Return a function (chunk, size) -> ``size`` bytes, which decompresses data of a grid with these ``flags``.
+
+    The function raises ValueError for a damaged chunk or another size. Without the Blosc bit, it decompresses zip.
+    """
     if not flags & BLOSC:
         return _unzip_vdb_chunk
     blosc = blosc_module()
@@ -135,7 +138,7 @@ def _unzip_vdb_chunk(chunk: bytes, size: int) -> bytes:
 
 MAGIC = 0x56444220
 VERSIONS = (222, 224)
-"""Oldest and newest file version read: 222 brought the present node layout, 223 Blosc, 224 changed point grids only."""
+"""Oldest and newest file version read. 222 introduced the present nodes, 223 Blosc; 224 changed only point grids."""
 
 _CHANNELS = {"Tree_float_5_4_3": 1, "Tree_vec3s_5_4_3": 3}
 _HALF = "_HalfFloat"

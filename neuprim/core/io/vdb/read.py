@@ -1,7 +1,9 @@
-"""Read grids: decode trees of root, upper nodes (32³ slots of 128³ voxels), lower nodes (16³ of 8³) and leaves.
+"""Read the grids of OpenVDB files.
 
-The layout is OpenVDB's (``RootNode``, ``InternalNode``, ``LeafNode``, ``io/Compression.h``), versions 222 to 224: first
-the topology, depth first, where a leaf is a mask of 64 bytes; then the values of all leaves in the same order.
+A grid is a tree: a root, upper nodes with 32³ slots of 128³ voxels, lower nodes with 16³ slots of 8³ voxels, and leaves
+of 8³ voxels. The layout is OpenVDB's (``RootNode``, ``InternalNode``, ``LeafNode``, ``io/Compression.h``), versions 222
+to 224. First comes the topology, depth first, where a leaf is a mask of 64 bytes. Then come the values of all leaves in
+the same order.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ LEAF_LIMIT = 4 * 2**30
 
 
 def read_grid(path: Path, name: str, *, max_bytes: int = LEAF_LIMIT, level_sets: bool = False) -> VdbGrid:
-    """Read one grid of an OpenVDB file; other grids are not decoded. Arguments and errors as of :func:`read_grids`."""
+    """Read only the grid ``name`` of an OpenVDB file. Arguments and errors are as in :func:`read_grids`."""
     return next(read_grids(path, (name,), max_bytes=max_bytes, level_sets=level_sets))
 
 
@@ -80,10 +82,11 @@ def _decode_grid(cursor: VdbCursor, file: FileHeader, header: GridHeader, max_by
 # ---------------------------------------------------------------- trees
 
 ALL_VALUES = 6
-"""The code of a node that stores every value, active or not. Codes of nodes that store active values alone:
+"""Value code of a node that stores the values of all its voxels. Other codes: only active values are stored.
 
-0: inactive values are the background; 1: minus the background; 2: one value, given; 3: a mask chooses background or its
-negative; 4: a mask chooses background or one value, given; 5: a mask chooses between two values, given.
+These codes say what the inactive values are. 0: the background; 1: minus the background; 2: one stored value; 3: the
+background or its negative; 4: the background or a stored value; 5: one of two stored values. For 3 to 5, a mask chooses
+per voxel.
 """
 
 _CHUNK = 1024  # leaves decoded together: 2 MB of float32, which stay in a core's cache
@@ -91,7 +94,11 @@ _LEAF = 512  # voxels
 
 
 class NodeSlots:
-    """Layout of the children of an internal node: number, edge length in voxels, and lowest indices in the node."""
+    """Layout of the slots of an internal tree node, which has 2^``log2`` slots per axis.
+
+    ``count`` is the number of slots, ``edge`` the edge length of a slot in voxels. ``offsets`` (count, 3) are the
+    lowest voxel indices of the slots, relative to the node.
+    """
 
     def __init__(self, log2: int, edge: int) -> None:
         self.count, self.edge = 1 << 3 * log2, edge
@@ -103,7 +110,7 @@ UPPER, LOWER = NodeSlots(5, 128), NodeSlots(4, 8)
 
 
 class _TreeReader:
-    """Decoder of a grid's tree into arrays of a VdbGrid, limited to ``max_bytes``; errors call the grid ``what``."""
+    """Decoder of a grid's tree into the arrays of a VdbGrid, at most ``max_bytes``; errors name the grid ``what``."""
 
     def __init__(self, file: VdbCursor, source: GridHeader, what: str, max_bytes: int) -> None:
         self._buffers = VdbCursor(file.path, file.data, source.block, source.end)
@@ -172,7 +179,7 @@ class _TreeReader:
             self._leaf_origins.append(lower + leaves)
 
     def _node(self, origin: np.ndarray, slots: NodeSlots) -> np.ndarray:
-        """Read an internal node and store its tiles; return the slots that are children, in order."""
+        """Read the internal node at voxel ``origin`` and store its tiles; return the indices of slots with children."""
         cursor, what = self._cursor, f"a node of {self._what}"
         children, active = (_unpack_vdb_mask(cursor.take(slots.count // 8, f"masks of {what}")) for _ in range(2))
         values = self._values(active, slots.count, what)
@@ -200,7 +207,10 @@ class _TreeReader:
         return VdbTiles(places, repeated, numbers, np.concatenate(active))
 
     def _values(self, active: np.ndarray, count: int, what: str) -> np.ndarray | None:
-        """Read (count,) or (count, 3) float32 values; return None if all are the background and not active."""
+        """Read the values of a node's ``count`` slots, (count,) or (count, 3) float32.
+
+        ``active`` is the (count,) mask of active slots. Returns None if all are inactive and have the background value.
+        """
         cursor = self._cursor
         code, low, high, chosen = self._inactive(cursor, count, what)
         whole = not self._flags & MASK or code == ALL_VALUES
@@ -218,7 +228,11 @@ class _TreeReader:
         return values
 
     def _inactive(self, cursor: VdbCursor, count: int, what: str) -> tuple[int, np.ndarray, np.ndarray, bytes | None]:
-        """Read a node's value code, its two inactive values, and the mask of voxels with the second one, or None."""
+        """Read the value code of a node (see ALL_VALUES) and what describes its inactive values.
+
+        Returns the code, two inactive values, and the mask of the voxels with the second value, or None if all have the
+        first.
+        """
         code = cursor.take(1, f"value code of {what}")[0]
         if code > ALL_VALUES:
             raise cursor.fail(f"{what} has the value code {code} at byte {cursor.at - 1}; expected 0 to {ALL_VALUES}")
@@ -257,7 +271,7 @@ class _TreeReader:
         return np.frombuffer(raw, "<f4").reshape(self._shape).astype(np.float32)
 
     def _leaves(self, first: int, last: int) -> None:
-        """Decode leaves ``first`` to ``last`` - 1: loop over their headers, then convert all values at once."""
+        """Decode leaves ``first`` to ``last`` - 1 into ``values`` and ``masks``; convert all values at once."""
         masks, special, whole, payloads = self._leaf_bytes(first, last)
         active = _unpack_vdb_mask(masks).reshape(-1, _LEAF)
         values = self.values[first:last]
@@ -280,9 +294,10 @@ class _TreeReader:
     def _leaf_bytes(
         self, first: int, last: int
     ) -> tuple[bytes, list[tuple[int, Any, Any, bytes | None]], list[int], bytes]:
-        """Read the bytes of leaves.
+        """Read and decompress the bytes of leaves ``first`` to ``last`` - 1.
 
-        Returns (masks, leaves with inactive values other than the background, leaves that store all values, values).
+        Returns their masks, the leaves whose inactive values are not the background (index, two values, mask of the
+        second or None), the indices of leaves that store all values, and the stored values. Indices start at ``first``.
         """
         cursor, what = self._buffers, f"a leaf of {self._what}"
         data, unpack, size_at = cursor.data, self._unpack, struct.Struct("<q").unpack_from
@@ -405,7 +420,7 @@ def list_vdb_files(path: Path) -> VdbSequence:
 
 
 def _split_frame_number(name: str) -> tuple[str, int] | None:
-    """Return a .vdb file's name without its last number, and that number; None for a name without a number."""
+    """Split a file name into its sequence's name (without suffix and number) and its last number; None without one."""
     match = re.fullmatch(r"(.*?)([0-9]+)([^0-9]*)", Path(name).stem, re.DOTALL)
     if match is None or len(match[2]) > 18:
         return None

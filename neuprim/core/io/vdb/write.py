@@ -18,7 +18,7 @@ from neuprim.core.io.vdb.header import BLOSC, MAGIC, MASK, ZIP, blosc_module, vd
 from neuprim.core.io.vdb.read import ALL_VALUES, LOWER, UPPER, NodeSlots
 
 COMPRESSIONS = {"none": MASK, "zip": ZIP | MASK, "blosc": BLOSC | MASK}
-"""Names of the compressions."""
+"""Name of a compression -> the compression bits that a grid's header stores."""
 
 _VERSION = 224
 _LIBRARY = (10, 0)
@@ -120,7 +120,7 @@ def _grid_metadata(grid: VdbGrid, flags: int, where: str) -> bytes:
 
 
 def _pack_vdb_transform(matrix: np.ndarray, where: str) -> bytes:
-    """Encode a (4, 4) transform as the simplest of OpenVDB's maps that represents it exactly."""
+    """Encode a (4, 4) index-to-world transform as the simplest class of OpenVDB's maps that represents it exactly."""
     matrix = np.asarray(matrix, np.float64)
     sound = matrix.shape == (4, 4) and np.isfinite(matrix).all() and (matrix[3] == (0, 0, 0, 1)).all()
     if not sound or np.linalg.det(matrix) == 0:
@@ -139,7 +139,7 @@ def _pack_vdb_transform(matrix: np.ndarray, where: str) -> bytes:
 
 
 class _TreeWriter:
-    """Encodes the tree of a grid into its two parts, ``topology`` and ``buffers``."""
+    """Encoder of a grid's tree as OpenVDB's bytes: ``topology`` (nodes and masks), and ``buffers`` (leaf values)."""
 
     def __init__(self, grid: VdbGrid, flags: int, where: str) -> None:
         self._grid, self._where = grid, where
@@ -215,7 +215,10 @@ class _TreeWriter:
         tiles: np.ndarray,
         slots: NodeSlots,
     ) -> None:
-        """Append an internal node: masks of children and of active tiles, and the tiles' values."""
+        """Append an internal node to ``parts``: masks of children and of active tiles, and the tiles' values.
+
+        ``children`` are slot numbers of the node at voxel ``origin``; ``tiles`` are indices of the grid's tiles.
+        """
         grid = self._grid
         has_child, active = np.zeros(slots.count, bool), np.zeros(slots.count, bool)
         values = np.empty((slots.count, *grid.background.shape), np.float32)
@@ -228,7 +231,7 @@ class _TreeWriter:
         parts.append(self._values(values, active))
 
     def _values(self, values: np.ndarray, active: np.ndarray) -> bytes:
-        """Encode the values of a node: value code, an inactive value if the code needs one, stored values."""
+        """Encode the values of a node or leaf: value code, an inactive value if the code needs one, stored values."""
         grid = self._grid
         inactive = values[~active]
         code, extra = 0, b""
@@ -246,7 +249,10 @@ class _TreeWriter:
 def _group_by_block(
     size: int, leaves: np.ndarray, tiles: np.ndarray
 ) -> list[tuple[tuple[int, int, int], tuple[np.ndarray, np.ndarray]]]:
-    """Return (corner, (leaf indices, tile indices)) for each block of ``size`` voxels that has leaves or tiles."""
+    """Group leaves and tiles, given by their lowest voxel indices (N, 3), by aligned cubes of edge ``size`` voxels.
+
+    Returns (lowest corner, (leaf indices, tile indices)) for each cube that has any.
+    """
     corners, inverse = np.unique(np.concatenate([leaves, tiles]) // size * size, axis=0, return_inverse=True)
     order, count = np.argsort(inverse, kind="stable"), len(leaves)
     ends = np.cumsum(np.bincount(inverse.ravel(), minlength=len(corners))).tolist()
@@ -258,14 +264,17 @@ def _group_by_block(
 
 
 def _vdb_slot_numbers(corners: np.ndarray, origin: tuple[int, int, int], slots: NodeSlots) -> np.ndarray:
-    """Return the slot numbers, in a node at ``origin``, of the children at ``corners`` (n, 3)."""
+    """Return the (n,) slots, in a node at ``origin``, of children whose lowest voxel indices are ``corners`` (n, 3)."""
     edge = round(slots.count ** (1 / 3))
     x, y, z = ((corners - np.array(origin)) // slots.edge).astype(np.int64).T
     return np.asarray((x * edge + y) * edge + z)
 
 
 def _value_packer(flags: int, unit: int) -> Callable[[bytes], bytes]:
-    """Return the function that packs values of ``unit`` bytes. Compressed values are preceded by their length."""
+    """Return a function that compresses the bytes of a node's values, of ``unit`` bytes each, as ``flags`` say.
+
+    The function puts the length in front of compressed values, and minus the length if they did not get smaller.
+    """
     if not flags & (ZIP | BLOSC):
         return lambda raw: raw
     blosc = blosc_module() if flags & BLOSC else None

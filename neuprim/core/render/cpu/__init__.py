@@ -1,1 +1,1 @@
-"""The cpu backend, in numba on all cores: per-primitive stage in float64, pixel stage in float32."""
+"""The cpu backend, in numba on all cores. Projects primitives in float64; computes pixels in float32."""

@@ -73,7 +73,7 @@ def _cpu_array(tensor: Tensor) -> Array:
 
 
 def _rasterizer_arrays_by_name(tensors: Sequence[Tensor]) -> dict[str, Array]:
-    """Return tensors as numpy arrays by name; all float64 if dtypes differ, so that no mixed kernels are compiled."""
+    """Return tensors as numpy arrays by name; all as float64 if dtypes differ, because kernels take only one dtype."""
     arrays = [_cpu_array(x) for x in tensors]
     if len({x.dtype for x in arrays}) > 1:
         arrays = [x.astype(np.float64, copy=False) for x in arrays]
@@ -82,7 +82,7 @@ def _rasterizer_arrays_by_name(tensors: Sequence[Tensor]) -> dict[str, Array]:
 
 @lru_cache(maxsize=4)
 def _ray_norms(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Array:
-    """Return (H, W) float32 lengths of the pixels' ray directions, scaled to camera-z 1."""
+    """Return (H, W) float32 lengths of the pixels' ray directions, each scaled so that its camera-z is 1."""
     x = (np.arange(width) + 0.5 - cx) / fx
     y = (np.arange(height) + 0.5 - cy) / fy
     result: Array = np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2).astype(np.float32)
@@ -253,14 +253,14 @@ def _float32_render_image(tensor: Tensor) -> Array:
 def render(
     lowered: LoweredPrimitives, camera: Camera, background: Tensor | None, settings: RenderSettings
 ) -> RenderOutput:
-    """Render a frame; see :data:`neuprim.core.render.output.Draw`."""
+    """Render a frame on the CPU; for arguments and result see :data:`neuprim.core.render.output.Draw`."""
     return rasterize(_Rasterize, "cpu", lowered, camera, background, settings)
 
 
 def render_slabs(
     lowered: LoweredPrimitives, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
-    """Render all slabs as one frame; for the result see :func:`neuprim.core.render.render_slabs`."""
+    """Render all slabs (groups of primitives) in one frame; see :func:`neuprim.core.render.render_slabs`."""
     means = lowered.geometry.means
     request = RasterRequest.of(lowered, camera, settings, RenderStats("cpu", len(means)))
     frame = _prepare_frame(request, camera.viewmat, rasterizer_tensors(lowered), (slabs.numpy(), count))

@@ -1,7 +1,8 @@
-"""Backward pass of compositing sorted by centres: goes back to front and recovers T as T/(1 - alpha).
+"""Backward pass of compositing sorted by the primitives' centres; goes back to front and recovers T as T/(1 - alpha).
 
-A lane is one pixel of a (tile, primitive) pair. The forward pass saved the lanes' optical depths. Each pair writes one
-row of gradients. The rows of a primitive are added in a fixed order, so any number of threads gives the same bits.
+T is a pixel's transmittance. A lane is one pixel of a (tile, primitive) pair. The forward pass saved the lanes' optical
+depths. Each pair writes one row of gradients. The rows of a primitive are added in a fixed order, so any number of
+threads gives the same bits.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class ImageGradient(NamedTuple):
 
 @inline
 def lane_optical_depths(S, n, edge):  # type: ignore[no-untyped-def]
-    """Fill DEPTH, the optical depth of every lane, as in the forward pass."""
+    """Fill DEPTH, the optical depth of ``n`` lanes (pixels of one (tile, primitive) pair), as in the forward pass."""
     for k in range(n):
         depth = S[L.FIELD + k] * S[L.HALF + k] * S[L.NORM_L + k] * f(2)
         if len(edge) > 0:
@@ -76,7 +77,10 @@ def lane_optical_depths(S, n, edge):  # type: ignore[no-untyped-def]
 
 @inline
 def lane_opacities(S, n, amin, amax):  # type: ignore[no-untyped-def]
-    """Fill ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF FADE) from DEPTH; ``amin``, ``amax`` as in forward."""
+    """Fill ALPHA, the opacity of ``n`` lanes (pixels), 1/(1 - alpha) and SLOPE from DEPTH, the optical depth.
+
+    SLOPE is d alpha/d(2 FIELD HALF FADE), the derivative by the density integral. ``amin`` and ``amax`` bound alpha.
+    """
     for k in range(n):
         norm, depth = S[L.NORM_L + k], S[L.DEPTH + k]
         raw = one_minus_exp(depth)
@@ -94,7 +98,10 @@ def lane_opacities(S, n, amin, amax):  # type: ignore[no-untyped-def]
 
 @inline
 def _uncomposite_rgb_row(state, S, base, at, sums, a, b, rank, color, net):  # type: ignore[no-untyped-def]
-    """For three channels: recover T of a row of pixels, fill GRAD, with a ``net`` dL/d RAY_COLOUR; add to ``sums``."""
+    """Undo the compositing of one primitive in a row of pixels, for three channels: recover transmittance T, fill GRAD.
+
+    With a ``net``, also fill dL/d RAY_COLOUR. Adds weights, errors and colour gradients to ``sums``.
+    """
     a, b = f(a), f(b)
     c0, c1, c2 = color[0], color[1], color[2]
     for k in range(P.TILE):
@@ -140,7 +147,7 @@ def _uncomposite_rgb_row(state, S, base, at, sums, a, b, rank, color, net):  # t
 
 @inline
 def _weigh_colours(state, S, base, at, cg, color, net):  # type: ignore[no-untyped-def]
-    """Add the sum over all channels of colour times dL/d colour to ``cg``, for any number of channels."""
+    """For any number of channels: add the sum over channels of colour times dL/d colour to ``cg`` of a pixel row."""
     for c in range(color.shape[0]):
         st = state[L.G_COLOR + c * P.PIXELS + base :]
         if net is None:
@@ -155,9 +162,10 @@ def _weigh_colours(state, S, base, at, cg, color, net):  # type: ignore[no-untyp
 
 @inline
 def _uncomposite_row(state, S, base, at, cg, w, a, b, rank):  # type: ignore[no-untyped-def]
-    """For any number of channels, with depth: recover T of a row of pixels; fill weights ``w`` and GRAD.
+    """Undo the compositing of one primitive in a row of pixels: recover transmittance T, fill weights ``w`` and GRAD.
 
-    ``cg`` is the sum over channels of colour times dL/d colour, plus z dL/dz if depth has a gradient.
+    For any number of channels, with depth. ``cg`` is the sum over channels of colour times dL/d colour, plus z dL/dz if
+    depth has a gradient.
     """
     a, b = f(a), f(b)
     st, lanes = state[base:], S[L.ALPHA + at :]
@@ -180,7 +188,7 @@ def _uncomposite_row(state, S, base, at, cg, w, a, b, rank):  # type: ignore[no-
 
 @inline
 def _add_row_sums(state, S, base, at, w, sums, a, b, C, net):  # type: ignore[no-untyped-def]
-    """For any number of channels: add weights ``w``, w x error and colour gradients of one row to ``sums``.
+    """Add weights ``w``, w x error and colour gradients of one row of pixels to ``sums``; for any number of channels.
 
     With a ``net``, also fill dL/d RAY_COLOUR.
     """
@@ -203,7 +211,7 @@ def _add_row_sums(state, S, base, at, w, sums, a, b, C, net):  # type: ignore[no
 
 @inline
 def _compact_lane_gradients(S, n, with_depths):  # type: ignore[no-untyped-def]
-    """Compact the lanes that have a gradient (many have none), append zeros; return the number of lanes."""
+    """Move lanes (pixels) that have a gradient to the front, as many have none; append zeros; return their number."""
     count = 0
     for k in range(0, n, P.TILE):
         if with_depths:
@@ -228,7 +236,10 @@ def _sum_row(sums, first):  # type: ignore[no-untyped-def]
 
 @inline
 def _load_tile_gradients(state, tx, ty, norms, image, C):  # type: ignore[no-untyped-def]
-    """Fill the state of a tile's pixels; return 1 + the rank of the last primitive composited in any pixel."""
+    """Load what the backward pass needs of a tile's pixels into ``state``; return the number of primitives to visit.
+
+    This is 1 + the rank of the last primitive composited in any pixel.
+    """
     transmittance, last, g_rgb, g_transmittance, g_z, error, _, with_depth = image
     height, width = norms.shape
     state[:] = f(0)
@@ -375,7 +386,10 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
 
 @exact_kernel
 def sum_tile_pair_gradients(start, stop, first, slots, pair_rows, grads, touched):  # type: ignore[no-untyped-def]
-    """Fill grads[i], the sum of primitive i's pair rows in pair order, and touched[i], for i in ``start:stop``."""
+    """Fill grads[i], the sum of the gradient rows of primitive i's pairs, and touched[i], for i in ``start:stop``.
+
+    A pair is a tile and a primitive that reaches it. touched[i] is True if a pixel shows the primitive.
+    """
     for i in range(start, stop):
         g = grads[i]
         g[:] = np.float32(0)

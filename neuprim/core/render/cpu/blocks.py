@@ -1,6 +1,6 @@
 """Compute geometry and neurons of 32 primitives (a block) at a time, in float64.
 
-A block is one flat array with a column per quantity, at constant offsets, so that LLVM vectorises. Strict
+A block is one flat array with a column of 32 numbers per quantity, at constant offsets, so that LLVM vectorises. Strict
 floating-point arithmetic gives each primitive the same bits in any block.
 """
 
@@ -20,7 +20,7 @@ BLOCK = 32  # primitives per block: the columns below fit into the L1 cache
 
 
 def column(number: int) -> int:
-    """Return the offset of column ``number`` in the array of a block."""
+    """Return the offset of column ``number`` in the flat array of a block; a column has one number per primitive."""
     return BLOCK * number
 
 
@@ -60,7 +60,7 @@ def dot3(a, b):  # type: ignore[no-untyped-def]
 
 @strict
 def load_block(which, n, parameters, S):  # type: ignore[no-untyped-def]
-    """Load geometry and axes s/m of primitives ``which[:n]`` into a block; pad with copies of the last one."""
+    """Load geometry of primitives ``which[:n]``, and semi-axes over m, into a block; pad by repeating the last one."""
     means, log_scales, quats = parameters.means, parameters.log_scales, parameters.quats
     for k in range(BLOCK):
         i = which[min(k, n - 1)]
@@ -76,9 +76,10 @@ def load_block(which, n, parameters, S):  # type: ignore[no-untyped-def]
 
 @strict
 def project_block(S, view):  # type: ignore[no-untyped-def]
-    """Fill orientation B in camera axes, orientation LOCAL in scene axes, 1/|q|, centre, anchor (ANCHOR_Z, UX, UY).
+    """Compute for each primitive of a block its orientation, its centre in camera coordinates and its anchor pixel.
 
-    The anchor is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same value.
+    Fills B and LOCAL (orientation in camera and scene axes), INVERSE (1/|q|), CENTRE, ANCHOR_Z, UX and UY. The anchor
+    is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same value.
     """
     R, t, fx, fy, cx, cy, near = view.R, view.t, view.fx, view.fy, view.cx, view.cy, view.near
     r0, r1, r2 = (R[0, 0], R[0, 1], R[0, 2]), (R[1, 0], R[1, 1], R[1, 2]), (R[2, 0], R[2, 1], R[2, 2])
@@ -107,14 +108,18 @@ def project_block(S, view):  # type: ignore[no-untyped-def]
 
 @strict
 def _whiten_axis(b, s, u, v, fx, fy, w):  # type: ignore[no-untyped-def]
-    """Return E0, EX, EY and XA along an axis of the ellipsoid, from its column of B: a row of m S^-1 B^T."""
+    """Return E0, EX, EY and XA, the numbers of a primitive's rays, along one axis of the ellipsoid.
+
+    ``b`` is the axis's column of B (orientation in camera axes), and ``s`` its length over m. ``b`` / ``s`` is a row of
+    m S^-1 B^T, the matrix from camera axes to whitened axes.
+    """
     a0, a1, a2 = b[0] / s, b[1] / s, b[2] / s
     return a0 * u + a1 * v + a2, a0 / fx, a1 / fy, dot3((a0, a1, a2), w)
 
 
 @strict
 def _fill_block_rays(S, view):  # type: ignore[no-untyped-def]
-    """Fill the affine rays of a block, and TOTAL and BIGGEST, which reveal values that are not finite in float32."""
+    """Fill a block's rays in whitened space, and TOTAL and BIGGEST, which reveal values not finite in float32."""
     fx, fy, cx, cy, near = view.fx, view.fy, view.cx, view.cy, view.near
     for k in range(BLOCK):
         m, anchor_z, offset = S[M + k], S[ANCHOR_Z + k], S[BLOCK * P.OFFSET + k]
@@ -142,7 +147,10 @@ def _fill_block_rays(S, view):  # type: ignore[no-untyped-def]
 
 @strict
 def _fill_block_neurons(which, n, parameters, turns, S, waves):  # type: ignore[no-untyped-def]
-    """Fill ``waves`` (K, 6 BLOCK) with the neurons of a block and their rates."""
+    """Fill ``waves`` (K, 6 BLOCK) with the neurons of a block of primitives: frequencies, phase, amplitude and speed.
+
+    The speed is the length of the frequency vector, in turns per m.
+    """
     W1, b1, w2 = parameters.W1, parameters.b1, parameters.w2
     for k in range(BLOCK):
         S[FASTEST + k] = 0.0
@@ -170,7 +178,7 @@ def _fill_block_neurons(which, n, parameters, turns, S, waves):  # type: ignore[
 
 @strict
 def fill_block(which, n, parameters, view, S, waves):  # type: ignore[no-untyped-def]
-    """Fill a block, ``S`` and ``waves``, from primitives ``which[:n]``."""
+    """Compute geometry, rays and neurons of primitives ``which[:n]``; fill their block ``S`` and ``waves``."""
     load_block(which, n, parameters, S)
     for k in range(BLOCK):
         S[BLOCK * P.OFFSET + k] = parameters.b2[which[min(k, n - 1)]]
@@ -181,7 +189,10 @@ def fill_block(which, n, parameters, view, S, waves):  # type: ignore[no-untyped
 
 @strict
 def store_row(k, S, waves, rate, order, row):  # type: ignore[no-untyped-def]
-    """Copy primitive ``k`` of a block to ``row``, with neurons sorted by rising rate; fill ``rate`` and ``order``."""
+    """Copy primitive ``k`` of a block to ``row``, with neurons sorted by rising rate (speed of phase).
+
+    Also fills ``rate`` with the sorted rates and ``order`` with the neurons' indices.
+    """
     for j in range(P.NEURONS):
         row[j] = S[j * BLOCK + k]
     K = rate.shape[0]

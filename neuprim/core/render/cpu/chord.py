@@ -1,10 +1,11 @@
-"""The integral along one chord (ray inside an ellipsoid) in float32, forward and backward: geometry and functions.
+"""The integral along one chord (part of a ray inside an ellipsoid) in float32, forward and backward.
 
 cos, sinc and B_p of a phase in turns, and the exponential, are polynomials (tools/fit_polynomials.py). Phases in turns
-are reduced exactly to half a turn: ``r = u - rint(u)``. B_p replaces sinc for a soft edge of exponent p
-(:mod:`neuprim.core.model.edge`). Rates v are turns over half a chord: B_p(2 pi v). One polynomial serves up to half a
-turn, a longer one up to 1.5 turns. Beyond, B_1 = 3 (B_0 - cos z)/z^2 and B_2 = 15 (B_1 - B_0)/z^2, with
-dB_1/dz = -3 (B_1 - B_0)/z and dB_2/dz = -5 (B_2 - B_1)/z. float32 errors are below 2e-6 (tests/numerics).
+are reduced exactly to half a turn: ``r = u - rint(u)``. B_p replaces sinc for a soft edge (density that fades to zero
+at the ellipsoid's boundary) of exponent p (:mod:`neuprim.core.model.edge`). A neuron's rate v is the change of its
+phase over half a chord, in turns; its profile is B_p(2 pi v). One polynomial serves |v| up to half a turn, a longer one
+up to 1.5 turns. Beyond, B_1 = 3 (B_0 - cos z)/z^2 and B_2 = 15 (B_1 - B_0)/z^2, with z = 2 pi v, dB_1/dz = -3 (B_1 -
+B_0)/z and dB_2/dz = -5 (B_2 - B_1)/z. float32 errors are below 2e-6 (tests/numerics).
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from neuprim.core.model.edge import NORMS
 from neuprim.core.render import layout as P
 
 EDGE_TYPES: tuple[tuple[int, ...], ...] = ((), (0,), (0, 0))
-"""The exponents p = 0, 1, 2 as arguments of kernels: tuples of p zeros. A tuple's length is part of its type, so numba
-compiles a kernel only for each p that is drawn."""
+"""The edge exponents p = 0, 1, 2 as arguments of kernels: tuples of p zeros. A tuple's length is part of its type, so
+numba compiles one kernel per exponent, and only for the exponents that are used."""
 
 Kernel = Callable[..., Any]
 f = np.float32
@@ -104,7 +105,10 @@ _MEDIUM_SLOPE = {
 
 @inline
 def one_minus_exp(x):  # type: ignore[no-untyped-def]
-    """Return 1 - exp(-x) for x clamped to [0, 9.4] (alpha is at most 0.9999): expm1 of x/16, doubled four times."""
+    """Return 1 - exp(-x) for x clamped to [0, 9.4], which suffices as alpha is at most 0.9999.
+
+    Computes exp(-x/16) - 1 by a polynomial, then doubles its argument four times.
+    """
     r = min(max(x, f(0)), _CEIL) * _SIXTEENTH
     q = (((((_E6 * r + _E5) * r + _E4) * r + _E3) * r + _E2) * r + _ONE) * r
     q = q * (q + _TWO)
@@ -128,13 +132,13 @@ def sinc_turns(z):  # type: ignore[no-untyped-def]
 
 @inline
 def dsinc_turns(z):  # type: ignore[no-untyped-def]
-    """Return d/dz of :func:`sinc_turns`, by a separate fit, because cos - sinc cancels for small z."""
+    """Return the derivative of :func:`sinc_turns` by z; a polynomial of its own, as cos - sinc cancels for small z."""
     return ((((_D5 * z + _D4) * z + _D3) * z + _D2) * z + _D1) * z + _D0
 
 
 @inline
 def _chord_sinc_medium(t):  # type: ignore[no-untyped-def]
-    """Return sinc(2 pi v) from t = v^2 2/1.5^2 - 1, |v| <= 1.5."""
+    """Return sin(2 pi v)/(2 pi v) for |v| <= 1.5, from t = v^2 2/1.5^2 - 1, which lies in [-1, 1]."""
     low = ((((_M5 * t + _M4) * t + _M3) * t + _M2) * t + _M1) * t + _M0
     high = (((_M10 * t + _M9) * t + _M8) * t + _M7) * t + _M6
     t2 = t * t
@@ -143,7 +147,7 @@ def _chord_sinc_medium(t):  # type: ignore[no-untyped-def]
 
 @inline
 def _chord_dsinc_medium(t):  # type: ignore[no-untyped-def]
-    """Return d sinc / d(v^2) of :func:`_chord_sinc_medium`."""
+    """Return the derivative of sinc(2 pi v) by v^2 for |v| <= 1.5, from t = v^2 2/1.5^2 - 1."""
     return ((((((((_N9 * t + _N8) * t + _N7) * t + _N6) * t + _N5) * t + _N4) * t + _N3) * t + _N2) * t + _N1) * t + _N0
 
 
@@ -152,7 +156,7 @@ def _chord_dsinc_medium(t):  # type: ignore[no-untyped-def]
 
 @inline
 def _hard_sincs_slow(v, w):  # type: ignore[no-untyped-def]
-    """Return sinc(2 pi v) and sinc(2 pi w) for |v|, |w| <= 1/2."""
+    """Return sinc(2 pi v) and sinc(2 pi w) for the rates of two neurons, |v|, |w| <= 1/2; sinc x = sin x / x."""
     return sinc_turns(v * v), sinc_turns(w * w)
 
 
@@ -164,7 +168,7 @@ def _hard_slopes_slow(v, w):  # type: ignore[no-untyped-def]
 
 @inline
 def _hard_sincs_medium(v, w):  # type: ignore[no-untyped-def]
-    """Return sinc(2 pi v) and sinc(2 pi w) for |v|, |w| <= 3/2."""
+    """Return sinc(2 pi v) and sinc(2 pi w) for the rates of two neurons, |v|, |w| <= 3/2; sinc x = sin x / x."""
     return _chord_sinc_medium(v * v * _TO_UNIT - _ONE), _chord_sinc_medium(w * w * _TO_UNIT - _ONE)
 
 
@@ -181,7 +185,7 @@ def _hard_slopes_medium(v, w):  # type: ignore[no-untyped-def]
 
 @inline
 def _reduced_chord_rates(v, w):  # type: ignore[no-untyped-def]
-    """Return v and w reduced to half a turn, whether they already were, and 1/v and 1/w (1 if they were)."""
+    """Return rates v and w minus the nearest integers, whether |v|, |w| <= 1/2, and 1/v and 1/w (1 if <= 1/2)."""
     k, j = np.rint(v), np.rint(w)
     a, b = k == f(0), j == f(0)
     sv, sw = f(1) if a else v, f(1) if b else w
@@ -191,8 +195,10 @@ def _reduced_chord_rates(v, w):  # type: ignore[no-untyped-def]
 
 @inline
 def _hard_reduced(v, near, r, iv):  # type: ignore[no-untyped-def]
-    """Return sinc(2 pi v) and its derivative by v, for r = v - rint(v) and iv = 1/v: by polynomials if ``near`` (up to
-    half a turn), else r/v sinc(2 pi r) and (cos - sinc)/v."""
+    """Return sinc(2 pi v) and its derivative by v, for any rate v, from r = v - rint(v) and iv = 1/v.
+
+    If ``near`` (|v| is at most half a turn), both are polynomials, else r/v sinc(2 pi r) and (cos - sinc)/v.
+    """
     z = r * r
     x = sinc_turns(z)
     b = x if near else x * r * iv
@@ -200,7 +206,7 @@ def _hard_reduced(v, near, r, iv):  # type: ignore[no-untyped-def]
 
 
 def _horner_polynomial(coefficients: tuple[float, ...]) -> Kernel:
-    """Return an unrolled function of the polynomial with these coefficients, lowest first."""
+    """Return a function that evaluates the polynomial with these coefficients (lowest power first) without a loop."""
     first = f(coefficients[0])
     if len(coefficients) == 1:
 
@@ -219,7 +225,7 @@ def _horner_polynomial(coefficients: tuple[float, ...]) -> Kernel:
 
 
 def _split_chord_polynomial(coefficients: tuple[float, ...]) -> Kernel:
-    """Like :func:`_horner_polynomial`, for ten coefficients: two shorter chains, whose latencies overlap."""
+    """Like :func:`_horner_polynomial`, for ten coefficients, as two shorter chains whose latencies overlap."""
     low, high = _horner_polynomial(coefficients[:5]), _horner_polynomial(coefficients[5:])
 
     @inline
@@ -266,7 +272,10 @@ def _soft_reduced(p: int) -> Kernel:
 
     @inline
     def reduced(v, near, r, iv):  # type: ignore[no-untyped-def]
-        """Return (B_p, dB_p/dv) for r = v - rint(v) and iv = 1/v; by polynomials if ``near``, up to half a turn."""
+        """Return B_p(2 pi v) and its derivative by v, from r = v - rint(v) and iv = 1/v.
+
+        If ``near`` (|v| is at most half a turn), both are polynomials.
+        """
         z, iz = r * r, iv * f(1 / TAU)  # iz = 1/(2 pi v)
         b0, cosine = sinc_turns(z) * r * iv, cos_turns(z)
         b1 = f(3) * (b0 - cosine) * iz * iz
@@ -282,7 +291,10 @@ def _soft_reduced(p: int) -> Kernel:
 
 
 def _fast_chord_profiles(reduced: Kernel) -> tuple[Kernel, Kernel]:
-    """Return two functions of any rates v and w; both give B_p(2 pi v) and B_p(2 pi w), the second also derivatives."""
+    """Return two functions of the rates v and w of two neurons, for rates of any size.
+
+    Both give B_p(2 pi v) and B_p(2 pi w); the second also gives their derivatives by v and w.
+    """
 
     @inline
     def profiles(v, w):  # type: ignore[no-untyped-def]
@@ -317,7 +329,7 @@ _MEANS = tuple(f(n / 2) for n in NORMS)  # means of (1 - u^2)^p over [-1, 1]
 
 @inline_source
 def load_ray(p):  # type: ignore[no-untyped-def]
-    """Return the values of a primitive's row that :func:`intersect_chord` needs, to load once for all lanes."""
+    """Return the numbers of a primitive's row that :func:`intersect_chord` needs, to load once for many pixels."""
     return (
         p[P.E0], p[P.E0 + 1], p[P.E0 + 2], p[P.EX], p[P.EX + 1], p[P.EX + 2], p[P.EY], p[P.EY + 1], p[P.EY + 2],
         p[P.XA], p[P.XA + 1], p[P.XA + 2], p[P.XU], p[P.XU + 1], p[P.XU + 2], p[P.XV], p[P.XV + 1], p[P.XV + 2],
@@ -327,10 +339,11 @@ def load_ray(p):  # type: ignore[no-untyped-def]
 
 @inline_source
 def intersect_chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
-    """Return the chord of one pixel's ray, named as in the layout; ``half`` is 0 if the ray misses the primitive.
+    """Intersect one pixel's ray with a primitive; return the values of the chord, of which the last is ``half``.
 
-    ``pixel`` is 16 y + x in the tile, (``fx0``, ``fy0``) the offset of the tile's first pixel centre from the anchor,
-    and ``row`` the result of :func:`load_ray`.
+    The values are named as in :mod:`neuprim.core.render.cpu.layout`; ``half`` is 0 if the ray misses. ``pixel`` is 16 y
+    + x in the tile, (``fx0``, ``fy0``) the offset of the tile's first pixel centre from the anchor, and ``row`` the
+    result of :func:`load_ray`.
     """
     e0, e1, e2, x0, x1, x2, y0, y1, y2, a0, a1, a2, u0, u1, u2, v0, v1, v2, tu, tv, near = row
     y = np.floor(pixel * f(1 / P.TILE))
@@ -359,13 +372,19 @@ def intersect_chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
 
 @inline_source
 def half_chord_slope(D, ia, depth_floor, edge):  # type: ignore[no-untyped-def]
-    """Return dh/dD of h = sqrt(D ``ia``), with a floor on D; a soft edge needs none, as D^p outweighs D^-1/2."""
+    """Return dh/dD of the half chord h = sqrt(D ``ia``); a hard edge takes it at D of at least ``depth_floor``.
+
+    D is 0 at a silhouette. A soft edge needs no such floor, because its weight D^p outweighs D^-1/2.
+    """
     return f(0.5) * ia / np.sqrt(max(D, depth_floor if len(edge) == 0 else f(1e-12)) * ia)
 
 
 @inline_source
 def chord_edge_fade(D, edge):  # type: ignore[no-untyped-def]
-    """Return FADE of a whole chord, the mean of (1 - |y|^2)^p, and dFADE/dD; 1 and 0 for a hard edge."""
+    """Return FADE, the mean edge weight (1 - |y|^2)^p of an uncut chord, and dFADE/dD; 1 and 0 for a hard edge (p = 0).
+
+    ``D`` is 1 - |y|^2 at the chord's middle.
+    """
     inner = max(D, f(0))
     if len(edge) == 0:
         return f(1), f(0)
@@ -378,10 +397,11 @@ def chord_edge_fade(D, edge):  # type: ignore[no-untyped-def]
 def chord_backward(  # type: ignore[no-untyped-def]
     g_half, g_mid, g_tm, gD, gA, half, ex, ey, ez, px, py, pz, mid, tm, ia, h, uncut, dh, qx, qy, qz, vx, vy, vz,
 ):  # fmt: skip
-    """Return dL/d(origin m, direction e) of a ray from ``g_half``, ``g_mid``, q = dL/d(chord middle), v = dL/d(half e).
+    """Return dL/dm and dL/de of a ray with origin m and direction e, from the gradients of its chord.
 
-    ``g_tm``, ``gD`` and ``gA`` are the gradients by closest approach tm, D = 1 - |p|^2 and a = e.e, without the parts
-    through the chord's ends.
+    ``g_half`` and ``g_mid`` are the gradients by half chord and middle along the ray; q is dL/d(chord's middle point)
+    and v is dL/d(half e). ``g_tm``, ``gD`` and ``gA`` are the gradients by closest approach tm, D = 1 - |p|^2 (p is the
+    closest point) and a = e.e, without the parts through the chord's ends.
     """
     gex, gey, gez = vx * half + mid * qx, vy * half + mid * qy, vz * half + mid * qz
     gt1 = (g_mid + g_half) * f(0.5)
@@ -400,13 +420,16 @@ def chord_backward(  # type: ignore[no-untyped-def]
 
 @inline
 def zero_ray_sums():  # type: ignore[no-untyped-def]
-    """Return the zero sums with which :func:`add_ray_gradient` starts."""
+    """Return twelve zeros, the sums with which :func:`add_ray_gradient` starts."""
     return f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0)
 
 
 @inline
 def add_ray_gradient(sums, du, dv, slide, reach, gmx, gmy, gmz, gex, gey, gez):  # type: ignore[no-untyped-def]
-    """Return ``sums`` plus the dL/d(E0, EX, EY, XA) of one lane, from dL/dm and dL/de; ``reach`` is tc + slide."""
+    """Return ``sums`` plus one pixel's gradient by the 12 numbers E0, EX, EY, XA that define a primitive's rays.
+
+    dL/d(ray origin m) and dL/d(ray direction e) of the pixel are given; ``reach`` is tc + slide.
+    """
     a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, b0, b1 = sums
     hx, hy, hz = gex + reach * gmx, gey + reach * gmy, gez + reach * gmz
     return (
@@ -418,7 +441,7 @@ def add_ray_gradient(sums, du, dv, slide, reach, gmx, gmy, gmz, gex, gey, gez): 
 
 @inline
 def store_ray_gradient(sums, out):  # type: ignore[no-untyped-def]
-    """Write the sums of :func:`add_ray_gradient` into a gradient row."""
+    """Write the twelve sums of :func:`add_ray_gradient` into their columns of a gradient row."""
     a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, b0, b1 = sums
     out[P.E0], out[P.E0 + 1], out[P.E0 + 2] = a0, a1, a2
     out[P.EX], out[P.EX + 1], out[P.EX + 2] = a3, a4, a5

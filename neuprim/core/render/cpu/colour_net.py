@@ -1,9 +1,10 @@
-"""Colour networks (:class:`~neuprim.core.model.forms.RayNet`): per primitive in float64, and at lanes (pixels).
+"""Colour networks (:class:`~neuprim.core.model.forms.RayNet`), one per primitive, evaluated in each pixel.
 
-The input of a network is the chord's middle, which the density's pixel stage stores for each lane. The first layer is
-converted to whitened axes and turns once per primitive, like the density's neurons. The conversion does not depend on
-the camera. RAY_COLOUR holds colours before max(0, .). Three channels have fused loops. Other numbers of channels, and
-float64, use scratch memory ``V``.
+The input of a network is the middle of a ray's chord, which the density's pixel stage stores for each lane (a pixel of
+one (tile, primitive) pair). The first layer is converted in float64 to whitened axes (units of the semi-axes) and to
+turns, once per primitive, like the density's neurons. The conversion does not depend on the camera. RAY_COLOUR holds
+colours before max(0, .). Three channels have fused loops. Other numbers of channels, and float64, use scratch memory
+``V``.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ Array = np.ndarray[Any, Any]
 
 
 class ColourNet(NamedTuple):
-    """The colour networks of all primitives of a frame, as input of the pixel kernels."""
+    """The colour networks of all primitives of a frame, as the pixel kernels read them."""
 
     # (N, net_row_width) float32: per unit its first layer (WX, WY, WZ, PHASE: whitened axes, turns), then C output
     # weights
@@ -42,7 +43,10 @@ class ColourNet(NamedTuple):
 
 @exact_kernel
 def _fill_net_rows(start, stop, which, log_scales, quats, Wx, bias, Wout, out, fast):  # type: ignore[no-untyped-def]
-    """Fill rows ``out[n]`` of primitives ``which[n]``; set ``fast[n]`` if a unit turns too fast for float32."""
+    """Fill ``out[n]`` with the network row of primitive ``which[n]``, for n in ``start:stop``.
+
+    ``fast[n]`` is set if the phase of a unit changes too fast along a chord for float32.
+    """
     H, C = Wx.shape[1], Wout.shape[1]
     local, axes = np.empty((3, 3)), np.empty(3)
     for n in range(start, stop):
@@ -72,7 +76,10 @@ def _fill_net_rows(start, stop, which, log_scales, quats, Wx, bias, Wout, out, f
 
 
 def prepare_rasterizer_colour_net(which: Array, t: dict[str, Array], wide: bool, threads: int) -> tuple[Array, Array]:
-    """Return network rows of primitives ``which``, float64 if ``wide``, and which networks are too fast for float32."""
+    """Return the network rows of primitives ``which``, float64 if ``wide``, and (len(which),) bool: which need float64.
+
+    A network needs float64 if the phase of a unit changes too fast along a chord. ``t`` holds the tensors by name.
+    """
     H, C = t["Wx"].shape[1], t["Wout"].shape[1]
     out = np.empty((len(which), L.net_row_width(H + H % 2, C)), np.float64 if wide else np.float32)
     fast = np.empty(len(which), np.bool_)
@@ -85,9 +92,10 @@ def prepare_rasterizer_colour_net(which: Array, t: dict[str, Array], wide: bool,
 def colour_net_backward(  # type: ignore[no-untyped-def]
     start, stop, log_scales, quats, Wx, rows, grads, first, touched, g_log_scales, g_quats, g_Wx, g_bias, g_Wout,
 ):  # fmt: skip
-    """Backpropagate gradient rows, whose network columns begin at ``first``, to primitives ``start:stop``.
+    """Compute the networks' gradients of primitives ``start:stop`` from gradient rows; they begin at column ``first``.
 
-    Adds to ``g_log_scales`` and ``g_quats``; the density's columns already include dL/d(chord middle).
+    Adds to ``g_log_scales`` and ``g_quats``. The gradient through the chord's middle is already part of the density's
+    columns.
     """
     H, C = Wx.shape[1], g_Wout.shape[1]
     local, gL, axes, gl, q, gq = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(4), np.empty(4)
@@ -145,7 +153,10 @@ def _ray_rgb_unit(p, o):  # type: ignore[no-untyped-def]
 
 @inline
 def _add_ray_rgb_units(S, V0, V1, n, p, o, o2, slopes):  # type: ignore[no-untyped-def]
-    """For three channels: add two units' outputs to RAY_COLOUR; with ``slopes``, fill units' cos and d cos/d turn."""
+    """Add the outputs of two network units at ``n`` lanes (pixels) to RAY_COLOUR, for three channels.
+
+    With ``slopes``, store each unit's cosine and its derivative by the phase in turns in ``V0`` and ``V1``.
+    """
     ax, ay, az, ab, a0, a1, a2 = _ray_rgb_unit(p, o)
     bx, by, bz, bb, b0, b1, b2 = _ray_rgb_unit(p, o2)
     for k in range(n):
@@ -168,7 +179,7 @@ def _add_ray_rgb_units(S, V0, V1, n, p, o, o2, slopes):  # type: ignore[no-untyp
 
 @inline
 def _unit_waves(S, V0, n, p, o):  # type: ignore[no-untyped-def]
-    """Fill cos and d cos/d turn of one unit."""
+    """Store one network unit's cosine and its derivative by the phase in turns, at ``n`` lanes (pixels), in ``V0``."""
     wx, wy, wz, b = p[o + P.WX], p[o + P.WY], p[o + P.WZ], p[o + P.PHASE]
     for k in range(n):
         u = S[L.QX + k] * wx + S[L.QY + k] * wy + S[L.QZ + k] * wz + b
@@ -180,7 +191,7 @@ def _unit_waves(S, V0, n, p, o):  # type: ignore[no-untyped-def]
 
 @inline
 def _unit_waves_float64(D, V0, n, p, o):  # type: ignore[no-untyped-def]
-    """Fill cos and d cos/d turn of one unit from a float64 row and float64 chord middles."""
+    """Like :func:`_unit_waves`, from a network's float64 row ``p`` and the float64 chord middles in ``D``."""
     for k in range(n):
         r = chord_phase_float64(D, k, p, o)
         z = r * r
@@ -190,7 +201,7 @@ def _unit_waves_float64(D, V0, n, p, o):  # type: ignore[no-untyped-def]
 
 @inline
 def _mix_net_outputs(S, V, n, p, hidden, C):  # type: ignore[no-untyped-def]
-    """For any number of channels: add the outputs of all units, from their cos in ``V``, to RAY_COLOUR."""
+    """Add the outputs of all network units to RAY_COLOUR, from their cosines in ``V``; for any number of channels."""
     for c in range(C):
         colour = S[L.RAY_COLOUR + c * L.LANES :]
         for j in range(hidden):
@@ -201,7 +212,10 @@ def _mix_net_outputs(S, V, n, p, hidden, C):  # type: ignore[no-untyped-def]
 
 @inline
 def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-untyped-def]
-    """Fill RAY_COLOUR of ``n`` lanes of primitive ``i``; with ``slopes`` also ``V`` for :func:`ray_colour_gradient`."""
+    """Evaluate the colour network of primitive ``i`` at ``n`` lanes (pixels); fill RAY_COLOUR, before max(0, .).
+
+    ``base`` is the constant colour. With ``slopes``, also fill ``V`` for :func:`ray_colour_gradient`.
+    """
     C, p = base.shape[0], net.rows[i]
     for c in range(C):
         colour = S[L.RAY_COLOUR + c * L.LANES :]
@@ -223,7 +237,7 @@ def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-unt
 
 @inline
 def _rgb_units_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped-def]
-    """For three channels: fill the gradients of two units in ``out``, and add the units' dL/dQ."""
+    """For three channels: write the gradients of two network units into ``out``; add to dL/dQ, Q the chord's middle."""
     ax, ay, az, _, a0, a1, a2 = _ray_rgb_unit(p, o)
     bx, by, bz, _, b0, b1, b2 = _ray_rgb_unit(p, o2)
     s0, s1, s2, s3, s4, s5, s6 = f(0), f(0), f(0), f(0), f(0), f(0), f(0)
@@ -259,7 +273,10 @@ def _rgb_units_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped
 
 @inline
 def _unit_gradient(S, V0, n, p, o, C, out):  # type: ignore[no-untyped-def]
-    """For any number of channels: fill a unit's gradients, and add its dL/dQ. Overwrites the unit's cos in ``V0``."""
+    """For any number of channels: write a network unit's gradients into ``out``; add to dL/dQ, Q the chord's middle.
+
+    Overwrites the unit's cosines in ``V0``.
+    """
     wx, wy, wz = p[o + P.WX], p[o + P.WY], p[o + P.WZ]
     for c in range(C):
         gradient, total = S[L.RAY_COLOUR + (C + c) * L.LANES :], f(0)
@@ -287,7 +304,10 @@ def _unit_gradient(S, V0, n, p, o, C, out):  # type: ignore[no-untyped-def]
 
 @inline
 def ray_colour_gradient(S, V, n, i, net, C, out, base_at):  # type: ignore[no-untyped-def]
-    """From dL/d RAY_COLOUR, fill gradients in ``out``: of the base at ``base_at``, then of the units; add to dL/dQ."""
+    """Write the gradients of a colour network into ``out``: of its constant colour at ``base_at``, then of its units.
+
+    The input is dL/d RAY_COLOUR of ``n`` lanes (pixels). Also adds to dL/dQ, Q the middles of the chords.
+    """
     p, row = net.rows[i], out[base_at + C :]
     for c in range(C):
         gradient, total = S[L.RAY_COLOUR + (C + c) * L.LANES :], f(0)

@@ -1,9 +1,10 @@
-"""Compositing sorted by the point where each ray enters each primitive (``sort = "entry"``), forward and backward.
+"""Compositing in the order in which each ray enters the primitives (``sort = "entry"``), forward and backward.
 
-A pass over a tile's primitives lists the hits (pixels whose ray meets a primitive). Each pixel's hits are sorted and
-composited front to back. The backward pass repeats this, computes GRAD of every hit back to front, and in a second pass
-over the primitives writes the same gradient rows as the default kernel. No pixel can stop early, so hidden primitives
-take time. Entries that agree in float32, and chords cut by the near plane, stay in the order of the centres.
+For each tile of 16 x 16 pixels, a pass over its primitives lists the hits (pixels whose ray meets a primitive). Each
+pixel's hits are sorted and composited front to back. The backward pass repeats this and computes the gradient by the
+density integral (GRAD) of every hit, back to front. A second pass over the primitives then writes the same gradient
+rows as the default kernel. No pixel can stop early, so hidden primitives take time. Hits whose entries agree in
+float32, and chords cut by the near plane, stay in the order of the primitives' centres.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class _PairLanes(NamedTuple):
 
 
 class _Hits(NamedTuple):
-    """The hits of one tile, in the order of its (tile, primitive) pairs."""
+    """The hits of one tile (pixels whose ray meets a primitive), in the order of its (tile, primitive) pairs."""
 
     values: Array
     marks: Array
@@ -97,14 +98,14 @@ def _allocate_hits(start, stop, across, frame, C, net):  # type: ignore[no-untyp
 
 @inline
 def _gather_lanes(lanes, frame, pair):  # type: ignore[no-untyped-def]
-    """Compact the pixels of one pair into lanes; return the number of lanes."""
+    """Gather the pixels of one (tile, primitive) pair inside the silhouette into lanes; return the number of lanes."""
     row_spans(frame.spans[pair.i], pair, lanes.rows_live, lanes.bounds)
     return compact_lanes(lanes.S, lanes.state, lanes.offset, lanes.bounds, pair.y0, pair.y1)
 
 
 @inline
 def _load_tile_norms(lanes, norms, tx, ty):  # type: ignore[no-untyped-def]
-    """Load the ray norms of a tile's pixels, and which rows of the tile lie in the image."""
+    """Load which rows of a tile lie in the image, and the lengths of its pixels' ray directions whose camera-z is 1."""
     height, width = norms.shape
     for y in range(P.TILE):
         lanes.rows_live[y] = f(1) if ty + y < height else f(0)
@@ -115,7 +116,10 @@ def _load_tile_norms(lanes, norms, tx, ty):  # type: ignore[no-untyped-def]
 
 @inline
 def _list_tile_hits(lanes, hits, frame, first, end, tx, ty, colors, net, edge):  # type: ignore[no-untyped-def]
-    """List the hits of a tile; return (number of hits, number of evaluated lanes)."""
+    """List the hits of a tile (pixels whose ray meets a primitive); return (number of hits, number of evaluated lanes).
+
+    A lane is one pixel of a (tile, primitive) pair.
+    """
     S, D, offset, bounds = lanes.S, lanes.D, lanes.offset, lanes.bounds
     values, marks = hits.values, hits.marks
     count, evaluated = 0, 0
@@ -157,7 +161,8 @@ def _list_tile_hits(lanes, hits, frame, first, end, tx, ty, colors, net, edge): 
 def _sort_tile_hits(count, hits):  # type: ignore[no-untyped-def]
     """Fill ``listing``, the hits sorted by pixel and entry, and ``pixel_start``, each pixel's first index in it.
 
-    A counting sort by pixel keeps the order of the centres; a stable insertion sort follows, as few hits move far.
+    A counting sort by pixel keeps each pixel's hits in the order of the primitives' centres. A stable insertion sort by
+    entry follows; few hits move far.
     """
     values, marks, listing, begin = hits.values, hits.marks, hits.listing, hits.pixel_start
     begin[:] = 0
@@ -185,7 +190,10 @@ def _sort_tile_hits(count, hits):  # type: ignore[no-untyped-def]
 
 @kernel
 def composite_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # type: ignore[no-untyped-def]
-    """Like :func:`~neuprim.core.render.cpu.forward.composite_tiles`, but ``image.last`` counts hits per pixel."""
+    """Render tiles ``start:stop``, with each pixel's hits sorted by entry; return the number of evaluated lanes.
+
+    For arguments see :func:`~neuprim.core.render.cpu.forward.composite_tiles`; ``image.last`` counts hits per pixel.
+    """
     frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
     height, width = frame.norms.shape
     across = (width + P.TILE - 1) // P.TILE
@@ -231,7 +239,10 @@ def composite_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # t
 
 @inline
 def _uncomposite_hits(hits, ids, first, tx, ty, norms, colors, image, tmin, net):  # type: ignore[no-untyped-def]
-    """Composite the hits of one tile again, then go back to front: fill weight and GRAD of every hit."""
+    """Composite the hits of a tile again, then go back to front: fill every hit's weight and GRAD.
+
+    GRAD is the gradient by the hit's density integral.
+    """
     values, marks, listing, begin = hits.values, hits.marks, hits.listing, hits.pixel_start
     height, width = norms.shape
     for y in range(min(P.TILE, height - ty)):
@@ -264,7 +275,10 @@ def _uncomposite_hits(hits, ids, first, tx, ty, norms, colors, image, tmin, net)
 
 @kernel
 def backward_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # type: ignore[no-untyped-def]
-    """Like :func:`~neuprim.core.render.cpu.backward.backward_tiles`, but composite again."""
+    """Fill the gradient rows of the pairs of tiles ``start:stop``, with hits sorted by entry; return the lane count.
+
+    Unlike :func:`~neuprim.core.render.cpu.backward.backward_tiles`, it composites again.
+    """
     frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
     across = (frame.norms.shape[1] + P.TILE - 1) // P.TILE
     C, neurons, with_depth = colors.shape[1], frame.neurons, image.with_depth

@@ -1,9 +1,11 @@
-"""The float64 pixel stage, for the few primitives that need more than float32; results are rounded to float32 lanes.
+"""The pixel stage in float64, for the few primitives for which float32 is not accurate enough.
 
-Whole chords use the functions of the float32 stage, with phases reduced in float64. Those functions do not hold if the
-near plane cuts a chord with a soft edge. Along a chord u in [-1, 1], 1 - |y|^2 = D - a (shift + half u)^2 with D at the
-closest approach, a = e.e and shift from there to the middle. Its p-th power is a polynomial q; the mean of
-q cos(phase + z u) follows from the moments
+Results are rounded to the float32 arrays of the lanes (pixels of one (tile, primitive) pair). Chords (rays inside an
+ellipsoid) that the near plane does not cut use the functions of the float32 stage, with phases reduced in float64.
+Those functions do not hold if the near plane cuts a chord with a soft edge, where the density fades as (1 - |y|^2)^p,
+with y the point in units of the semi-axes. Along a chord u in [-1, 1], 1 - |y|^2 = D - a (shift + half u)^2 with D at
+the closest approach to the centre, a = e.e for ray direction e, and shift from the closest approach to the chord's
+middle. Its p-th power is a polynomial q; the mean of q cos(phase + z u) follows from the moments
 
     C_n = 1/2 integral of u^n cos(z u) du (n even),   S_n = 1/2 integral of u^n sin(z u) du (n odd),
     dC_n/dz = -S_(n+1), dS_n/dz = C_(n+1)
@@ -34,7 +36,10 @@ FLOAT64_SCRATCH = L.lane_array(10)
 
 @inline
 def chords_float64(S, X, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
-    """Like :func:`~neuprim.core.render.cpu.tiles.lane_chords`, in float64; return whether a chord is cut."""
+    """Compute the chords (rays inside the ellipsoid) of ``n`` lanes in float64; return whether the near plane cuts any.
+
+    Fills the same arrays as :func:`~neuprim.core.render.cpu.tiles.lane_chords`, and ``X`` with the float64 values.
+    """
     p, fx0, fy0 = frame.wide[frame.slots[pair.i]], pair.tx + 0.5, pair.ty + 0.5
     e0, e1, e2, tc, near = p[P.E0], p[P.E0 + 1], p[P.E0 + 2], p[P.TC], p[P.NEAR]
     x0, x1, x2, y0, y1, y2 = p[P.EX], p[P.EX + 1], p[P.EX + 2], p[P.EY], p[P.EY + 1], p[P.EY + 2]
@@ -82,14 +87,20 @@ def chords_float64(S, X, n, frame, pair, with_mid, backward, edge):  # type: ign
 
 @inline
 def chord_phase_float64(X, k, p, o):  # type: ignore[no-untyped-def]
-    """Return the phase, at the chord's middle, of the unit at ``o`` of a float64 row, reduced to half a turn."""
+    """Return the phase of a network unit at the middle of lane ``k``'s chord, in turns, reduced to [-1/2, 1/2].
+
+    ``p`` is a primitive's float64 row, and ``o`` the column in it where the unit begins.
+    """
     u = X[k + _Q0] * p[o + P.WX] + X[k + _Q1] * p[o + P.WY] + X[k + _Q2] * p[o + P.WZ] + p[o + P.PHASE]
     return f(u - np.rint(u))
 
 
 @inline
 def _reduced_chord_phases(X, k, p, o):  # type: ignore[no-untyped-def]
-    """Return, in turns, the phase at the chord's middle, reduced to half a turn, and its change over half a chord."""
+    """Return a neuron's phase at the middle of lane ``k``'s chord and its change over half the chord, both in turns.
+
+    The phase is reduced to [-1/2, 1/2]. ``p`` is the primitive's float64 row, and ``o`` the neuron's first column.
+    """
     wx, wy, wz = p[o + P.WX], p[o + P.WY], p[o + P.WZ]
     u = X[k + _Q0] * wx + X[k + _Q1] * wy + X[k + _Q2] * wz + p[o + P.PHASE]
     v = X[k + _V0] * wx + X[k + _V1] * wy + X[k + _V2] * wz
@@ -98,7 +109,11 @@ def _reduced_chord_phases(X, k, p, o):  # type: ignore[no-untyped-def]
 
 @inline
 def _whole_chord_neurons(S, X, V, n, p, neurons, edge):  # type: ignore[no-untyped-def]
-    """Add w2 cos(phase at the middle) B_p(phase change over half a chord) of every neuron to FIELD; fill ``V``."""
+    """Add each neuron's mean over a chord, w2 cos(phase at the middle) B_p(phase change over half a chord), to FIELD.
+
+    B_p is the profile of edge exponent p. The near plane must not cut a chord with a soft edge. ``V``, if not None,
+    gets the factors of the neurons' gradients.
+    """
     for m in range(neurons):
         o = P.NEURONS + P.PER_NEURON * m
         wx, wy, wz, phase, amplitude = p[o + P.WX], p[o + P.WY], p[o + P.WZ], p[o + P.PHASE], f(p[o + P.AMPLITUDE])
@@ -117,7 +132,10 @@ def _whole_chord_neurons(S, X, V, n, p, neurons, edge):  # type: ignore[no-untyp
 
 @inline
 def _chord_bessel(z, j):  # type: ignore[no-untyped-def]
-    """Fill ``j`` with j_0 to j_5 of any z: by a series below 2, where upward recursion loses digits."""
+    """Fill ``j`` with the spherical Bessel functions j_0 to j_5 at any z.
+
+    Below |z| = 2, where upward recursion loses digits, the function sums a series.
+    """
     if abs(z) < 2.0:
         square, power = 0.5 * z * z, 1.0
         for n in range(6):
@@ -136,7 +154,10 @@ def _chord_bessel(z, j):  # type: ignore[no-untyped-def]
 
 @inline
 def _chord_moments(z, j, M):  # type: ignore[no-untyped-def]
-    """Fill M[n] with C_n of ``z`` for even n and S_n for odd n, n = 0..5; overwrites ``j``."""
+    """Fill M[n], n = 0..5, with the mean over u in [-1, 1] of u^n cos(z u) for even n and of u^n sin(z u) for odd n.
+
+    Overwrites ``j``.
+    """
     _chord_bessel(z, j)
     M[0], M[1] = j[0], j[1]
     M[2], M[3] = (j[0] - 2.0 * j[2]) / 3.0, (3.0 * j[1] - 2.0 * j[3]) / 5.0
@@ -146,7 +167,10 @@ def _chord_moments(z, j, M):  # type: ignore[no-untyped-def]
 
 @inline
 def _edge_polynomial(D, shift, square, half, soft, q):  # type: ignore[no-untyped-def]
-    """Fill q[0..4], coefficients of (D - ``square`` (shift + half u)^2)^``soft``; return its mean over the chord."""
+    """Fill q[0..4] with the coefficients by u of the edge weight (D - ``square`` (shift + half u)^2)^``soft``.
+
+    u goes from -1 to 1 along the chord. Returns the mean weight over the chord.
+    """
     c0, c1, c2 = D - square * shift * shift, -2.0 * square * shift * half, -square * half * half
     q[0], q[1], q[2], q[3], q[4] = c0, c1, c2, 0.0, 0.0
     if soft == 2:
@@ -156,9 +180,10 @@ def _edge_polynomial(D, shift, square, half, soft, q):  # type: ignore[no-untype
 
 @inline
 def _cut_chord_neurons(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped-def]
-    """Add the neurons' weighted means to FIELD, and fill FADE, for soft-edged chords that the near plane cuts.
+    """Add the neurons' means to FIELD for soft-edged chords that the near plane cuts; fill FADE, the mean edge weight.
 
-    If ``V`` is given, fill it, and BY_D, BY_A, BY_TM from moments of the edge weight's derivative by 1 - |y|^2.
+    ``V``, if not None, gets the factors of the neurons' gradients. Then BY_D, BY_A and BY_TM are filled, too, from
+    moments of the edge weight's derivative by 1 - |y|^2.
     """
     q, j, M, rest = np.zeros(5), np.zeros(6), np.zeros(6), np.zeros(3)
     for k in range(n):
@@ -202,7 +227,11 @@ def _cut_chord_neurons(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped
 
 @inline
 def neurons_float64(S, X, V, n, p, neurons, cut, edge):  # type: ignore[no-untyped-def]
-    """Add every neuron's weighted mean to FIELD; if ``cut``, fill FADE; if ``V`` is not None, fill it for gradients."""
+    """Add the mean of every neuron over the chord, weighted by the edge, to FIELD of ``n`` lanes (pixels).
+
+    If ``cut`` (the near plane cuts a chord) and the edge is soft, also fill FADE, the mean edge weight. ``V``, if not
+    None, gets the factors that the neurons' gradients need.
+    """
     if len(edge) > 0 and cut:
         _cut_chord_neurons(S, X, V, n, p, neurons, len(edge))
     else:

@@ -1,7 +1,7 @@
-"""Forward pass of compositing sorted by centres, and the data that the pass saves for backward.
+"""Forward pass of compositing sorted by the primitives' centres, and the data that the pass saves for backward.
 
-A lane is one pixel of a (tile, primitive) pair. Saved are the optical depth of every evaluated lane (4 bytes), and per
-pair a mask of tile rows with unfinished pixels (2 bytes) and the first lane in its chunk of tiles (4 bytes). So the
+A lane is one pixel of a (tile, primitive) pair. The pass saves the optical depth of every evaluated lane (4 bytes). Per
+pair it saves a mask of tile rows with unfinished pixels (2 bytes) and the index of its first lane (4 bytes). So the
 backward pass can composite before it evaluates a neuron.
 """
 
@@ -49,7 +49,7 @@ class TileImage(NamedTuple):
 
 @dataclass
 class SavedForBackward:
-    """Data that the forward pass of one frame saves for backward."""
+    """Data that the forward pass of one frame saves for the backward pass; empty if no gradient is needed."""
 
     # (pairs,) bit y is set if row y of the tile was live when the pair was drawn; no pairs if nothing is saved
     live: Array
@@ -81,7 +81,7 @@ def _depth_array(floats):  # type: ignore[no-untyped-def]
 
 @inline
 def _max_lanes(start, stop, across, frame):  # type: ignore[no-untyped-def]
-    """Return an upper bound of the number of lanes of tiles ``start:stop``, a multiple of the vector width."""
+    """Return an upper bound of the number of lanes (pixels) of tiles ``start:stop``, a multiple of the vector width."""
     lanes = 0
     for t in range(start, stop):
         tx, ty = (t % across) * P.TILE, (t // across) * P.TILE
@@ -92,7 +92,10 @@ def _max_lanes(start, stop, across, frame):  # type: ignore[no-untyped-def]
 
 @inline
 def _store_opacities(S, n, frame, edge, keep, depths, at):  # type: ignore[no-untyped-def]
-    """Fill ALPHA: 0 below alpha_min and for integrals <= 0, at most alpha_max; if ``keep``, fill ``depths[at:]``."""
+    """Compute ALPHA, the opacity of ``n`` lanes (pixels); if ``keep``, save their optical depths in ``depths[at:]``.
+
+    Opacities below alpha_min and for integrals <= 0 become 0; others are at most alpha_max.
+    """
     amin, amax = frame.alpha_min, frame.alpha_max
     for k in range(n):
         depth = S[L.FIELD + k] * S[L.HALF + k] * S[L.NORM_L + k] * f(2)
@@ -111,7 +114,7 @@ def _store_opacities(S, n, frame, edge, keep, depths, at):  # type: ignore[no-un
 
 @inline
 def _composite_rgb_row(state, S, base, at, a, b, tmin, rank, color, net):  # type: ignore[no-untyped-def]
-    """For three channels: add alpha T times colour to each pixel of a row, then update T."""
+    """For three channels: composite a primitive onto a row of pixels: add alpha T colour, update transmittance T."""
     a, b = f(a), f(b)
     c0, c1, c2 = color[0], color[1], color[2]
     for k in range(P.TILE):
@@ -132,7 +135,7 @@ def _composite_rgb_row(state, S, base, at, a, b, tmin, rank, color, net):  # typ
 
 @inline
 def _composite_row(state, S, base, at, a, b, tmin, rank, w):  # type: ignore[no-untyped-def]
-    """For any number of channels, with depth: update T of a row of pixels, and fill the weights ``w``."""
+    """Composite a primitive onto a row of pixels, without colours: update transmittance T, fill ``w`` = alpha T."""
     a, b = f(a), f(b)
     st, lanes = state[base:], S[L.ALPHA + at :]
     for k in range(P.TILE):
@@ -147,7 +150,7 @@ def _composite_row(state, S, base, at, a, b, tmin, rank, w):  # type: ignore[no-
 
 @inline
 def _add_colours(state, S, base, at, w, color, net):  # type: ignore[no-untyped-def]
-    """For any number of channels: add ``w`` times ``color``, or with a ``net`` times RAY_COLOUR, to the colours."""
+    """For a row of pixels and any number of channels: add ``w`` times ``color``, or with a ``net`` times RAY_COLOUR."""
     for c in range(color.shape[0]):
         st = state[L.COLOR + c * P.PIXELS + base :]
         if net is None:
@@ -162,7 +165,7 @@ def _add_colours(state, S, base, at, w, color, net):  # type: ignore[no-untyped-
 
 @inline
 def _fill_background(tx, ty, down, wide_row, image):  # type: ignore[no-untyped-def]
-    """Fill a tile that no primitive reaches with the background."""
+    """Fill the pixels of a tile that no primitive reaches with the background."""
     for y in range(down):
         Y = index(ty + y)
         for x in range(wide_row):
@@ -197,6 +200,8 @@ def _store_tile(state, tx, ty, down, wide_row, image):  # type: ignore[no-untype
 @kernel
 def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, edge):  # type: ignore[no-untyped-def]
     """Render tiles ``start:stop``; return the number of evaluated lanes and, unless ``live`` is empty, their depths.
+
+    A lane is one pixel of a (tile, primitive) pair, its depth an optical depth.
 
     Args:
         frame: :class:`~neuprim.core.render.cpu.tiles.FrameArrays`.

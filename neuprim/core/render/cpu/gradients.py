@@ -1,7 +1,8 @@
-"""Compute the gradients of a (tile, primitive) pair from dL/d(2 FIELD HALF FADE) of its lanes (pixels), for both sorts.
+"""Compute the gradients of a (tile, primitive) pair from those of its lanes (pixels), for both orders of compositing.
 
-:func:`neuron_gradients` and :func:`chord_gradient` read stored chords, as needed for float64, colour networks and many
-neurons. :func:`gradients_at_once` keeps each chord in registers, for at most two neurons.
+A lane's gradient is dL/d(2 FIELD HALF FADE), the gradient by its density integral. :func:`neuron_gradients` and
+:func:`chord_gradient` read stored chords, as needed for float64, colour networks and many neurons.
+:func:`gradients_at_once` keeps each chord in registers, for at most two neurons.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ def _load_neuron(p, o):  # type: ignore[no-untyped-def]
 def _neuron_products(slopes):  # type: ignore[no-untyped-def]
     """Return a function that computes cos B, d(cos B)/d phase and cos dB/d rate of two neurons, B their chord profile.
 
-    ``slopes`` computes B and dB/d rate. The function's argument q is the chord middle, its v the half chord.
+    B is the factor by which a neuron's mean over a chord is smaller than its value at the middle. ``slopes`` computes B
+    and dB/d rate. The function's argument q is the chord middle, its v the half chord.
     """
 
     @inline
@@ -68,7 +70,10 @@ _slow, _medium, _fast = _neuron_products(slopes_slow), _neuron_products(slopes_m
 
 @inline
 def _add_neuron_gradient(sums, cosine, u, v, qx, qy, qz, vx, vy, vz):  # type: ignore[no-untyped-def]
-    """Return ``sums`` plus a lane's dL/d(amplitude, phase, W), without factor amplitude, from products x dL/d FIELD."""
+    """Return ``sums`` plus a lane's dL/d(amplitude, phase, W) of a neuron, without the factor amplitude.
+
+    ``cosine``, ``u`` and ``v`` are the results of :func:`_neuron_products` times dL/d FIELD.
+    """
     s0, s1, s2, s3, s4 = sums
     return s0 + cosine, s1 + u, s2 + (u * qx + v * vx), s3 + (u * qy + v * vy), s4 + (u * qz + v * vz)
 
@@ -157,7 +162,10 @@ _with_two_fast = _gradients_of_two_neurons(_fast)
 
 @inline
 def gradients_at_once(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-def]
-    """Fill the gradient row of a pair, from PIXEL and GRAD of its lanes; at most :data:`AT_ONCE` neurons."""
+    """Fill the gradient row of a (tile, primitive) pair, for at most :data:`AT_ONCE` neurons, from PIXEL and GRAD.
+
+    PIXEL and GRAD hold position and gradient of each lane (pixel of the pair).
+    """
     if frame.neurons == 0:
         _gradients_without_neurons(S, n, frame, pair, edge, out)
         return
@@ -175,9 +183,10 @@ def gradients_at_once(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-
 
 @inline
 def lanes_with_slopes(S, D, V, n, frame, pair, edge):  # type: ignore[no-untyped-def]
-    """Fill the chords of ``n`` lanes of a pair; in float64 also ``V``, three products per neuron.
+    """Compute the chords of ``n`` lanes (pixels) of a (tile, primitive) pair; in float64 also ``V``.
 
-    Returns True if the pair is in float64 and the near plane cuts a chord.
+    ``V`` gets three products per neuron for its gradients. Returns True if the pair is in float64 and the near plane
+    cuts a chord.
     """
     slot = frame.slots[pair.i]
     if slot >= 0:
@@ -190,7 +199,10 @@ def lanes_with_slopes(S, D, V, n, frame, pair, edge):  # type: ignore[no-untyped
 
 @inline
 def _chord_field_gradient(S, n, out, edge, in_float64):  # type: ignore[no-untyped-def]
-    """Fill dL/d FIELD from dL/d(2 FIELD HALF FADE), and FIELD from the optical depth; sum up dL/d b2 and log m."""
+    """Fill dL/d FIELD of ``n`` lanes from dL/d(2 FIELD HALF FADE); sum up dL/d b2 and the gradient by log m.
+
+    FIELD, the mean of the density network over a chord, is recovered from the optical depth, except in float64.
+    """
     offset, log_m = f(0), f(0)
     for k in range(n):
         g = f(2) * S[L.GRAD + k]
@@ -208,7 +220,8 @@ def _chord_field_gradient(S, n, out, edge, in_float64):  # type: ignore[no-untyp
 def _two_neuron_lane_gradients(products):  # type: ignore[no-untyped-def]
     """Return a function that computes gradients of neurons m and m + 1, dL/dQ and dL/d(half e).
 
-    If ``products`` is None, the function reads cos B and its derivatives from V0 and V1.
+    Q is the middle of a lane's chord, and half e its half chord as a vector. If ``products`` is None, the function
+    reads cos B and its derivatives from V0 and V1; B is a neuron's chord profile.
     """
 
     @inline
@@ -252,7 +265,10 @@ _two_float64 = _two_neuron_lane_gradients(None)
 
 @inline
 def neuron_gradients(S, V, n, p, kinds, neurons, edge, in_float64, cut, out):  # type: ignore[no-untyped-def]
-    """Fill the gradients of b2, log m and every neuron of a pair, and dL/dQ and dL/d(half e) of its lanes."""
+    """Fill the gradients of b2, log m and every neuron of a (tile, primitive) pair, and of its lanes' chords.
+
+    The latter are dL/dQ, Q the middle of the chord, and dL/d(half e), half e the half chord as a vector.
+    """
     _chord_field_gradient(S, n, out, edge, in_float64)
     for m in range(0, neurons, 2):
         kind = kinds[m // 2]
@@ -271,12 +287,12 @@ def neuron_gradients(S, V, n, p, kinds, neurons, edge, in_float64, cut, out):  #
 
 @inline
 def chord_gradient(S, n, p, out, edge, cut):  # type: ignore[no-untyped-def]
-    """Fill dL/d(E0, EX, EY, XA) of the affine ray from the gradients by chord middle, half chord and direction.
+    """Fill dL/d(E0, EX, EY, XA) of a primitive's rays from the gradients by chord middle, half chord and direction.
 
-    A hard edge has gradients through the chord's ends, t0 and t1. A soft edge has none, but its weight depends on
-    D = 1 - |p|^2, and if the near plane cuts the chord, on a = e.e and the closest approach. If no chord of the
-    pair is cut, BY_D is d FADE/dD, and the gradient through HALF is used. Otherwise (float64) the ends have no
-    gradient, and BY_D, BY_A and BY_TM are derivatives of the whole mean FADE FIELD.
+    A hard edge has gradients through the chord's ends, t0 and t1. A soft edge has none, but its weight depends on D = 1
+    - |p|^2 at the closest point p and, if the near plane cuts the chord, on a = e.e and the closest approach tm. If no
+    chord of the pair is cut, BY_D is d FADE/dD, and the gradient through HALF is used. Otherwise (float64) the ends
+    have no gradient, and BY_D, BY_A and BY_TM are derivatives of the whole mean FADE FIELD.
     """
     tc, soft = p[P.TC], len(edge)
     rays = zero_ray_sums()

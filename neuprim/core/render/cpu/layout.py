@@ -1,6 +1,6 @@
-"""Row widths and scratch memory of the numba kernels: scratch arrays lie at constant offsets in one flat array.
+"""Row widths of the numba kernels' arrays, and offsets of their scratch arrays, which all lie in one flat array.
 
-A *lane* is one pixel of a (tile, primitive) pair.
+A *lane* is one pixel of a (tile, primitive) pair. A tile has 16 x 16 pixels.
 """
 
 from __future__ import annotations
@@ -20,22 +20,28 @@ def _padded_row_width(floats: int) -> int:
 
 
 def row_width(neurons: int) -> int:
-    """Return the number of floats in a primitive's row, a multiple of 16; ``neurons`` is the number after padding."""
+    """Return the number of floats in a primitive's row, a multiple of 16; ``neurons`` is padded to an even number."""
     return _padded_row_width(NEURONS + PER_NEURON * neurons)
 
 
 def net_row_width(hidden: int, channels: int) -> int:
-    """Return the number of floats in a colour network's row, 1 without units; ``hidden`` counts units after padding."""
+    """Return the number of floats in the row of one primitive's colour network; 1 if the network has no hidden units.
+
+    ``hidden`` is the number of hidden units, padded to an even number.
+    """
     return max((NET_OUT + channels) * hidden, 1)
 
 
 def gradient_width(neurons: int, channels: int, hidden: int = 0) -> int:
-    """Return the number of floats in a gradient row, a multiple of 16; ``neurons`` and ``hidden`` include padding."""
+    """Return the number of floats in a gradient row (gradients of one primitive's numbers), a multiple of 16.
+
+    ``neurons`` and ``hidden`` (units of a colour network) are padded to even numbers.
+    """
     return _padded_row_width(G_NEURONS + PER_NEURON * neurons + channels + (NET_OUT + channels) * hidden)
 
 
 def lane_array(number: int) -> int:
-    """Return the offset of scratch array ``number``, which has one element per lane."""
+    """Return the offset of scratch array ``number`` in the flat scratch memory; it has one element per lane (pixel)."""
     return LANES * number
 
 

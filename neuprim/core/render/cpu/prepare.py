@@ -1,7 +1,8 @@
-"""The per-primitive stage of rendering, in float64: anchors, whitened rays, exact screen bounds.
+"""Project primitives to the screen, in float64: anchor pixels, rays in whitened space, exact screen bounds.
 
-The anchor of a primitive is its projected centre. Whitened rays are affine in the pixel offset from the anchor, so
-float32 need not represent the distance to the camera (method: "Line integral"). Anchor and unit of t have no gradient.
+In whitened space (units of the semi-axes), a primitive is the unit sphere. The anchor of a primitive is its projected
+centre. Whitened rays are affine in the pixel offset from the anchor, so float32 need not represent the distance to the
+camera (method: "Line integral"). Neither the anchor nor m, the unit of the ray parameter t, has a gradient.
 """
 
 from __future__ import annotations
@@ -58,7 +59,10 @@ class PrimitiveArrays(NamedTuple):
 
 
 class View(NamedTuple):
-    """A camera: world-to-camera rotation, translation, intrinsics, size, near plane; and ``turns`` = omega0 / 2 pi."""
+    """A camera: world-to-camera rotation R and translation t, intrinsics and size in pixels, depth of the near plane.
+
+    ``turns`` is omega0 / 2 pi, the density's factor from phases to turns.
+    """
 
     R: Array
     t: Array
@@ -87,7 +91,7 @@ class Projected(NamedTuple):
 
     @classmethod
     def allocate(cls, count: int, neurons: int) -> Projected:
-        """Allocate memory for ``count`` primitives with ``neurons`` each, padded to an even number."""
+        """Allocate memory for ``count`` primitives with ``neurons`` neurons each, padded to an even number."""
         padded = neurons + neurons % 2
         return cls(
             rows=np.empty((count, L.row_width(padded)), np.float32),
@@ -103,16 +107,19 @@ class Projected(NamedTuple):
 
 @strict
 def _is_too_faint_to_draw(most, edge, least):  # type: ignore[no-untyped-def]
-    """Return whether no chord can reach optical depth ``least``, as half chords are at most the longest semi-axis."""
+    """Return whether no chord through a primitive, wherever it is, can reach the optical depth ``least``.
+
+    ``most`` bounds density times m, and half chords are at most m, the longest semi-axis.
+    """
     return most <= 0.0 or most * NORMS[edge] <= least
 
 
 @strict
 def _visible_square(most, longest, edge, least):  # type: ignore[no-untyped-def]
-    """Return r^2 of an ellipsoid's visible extent in units of its semi-axes: 1 for all of it, 0 for nothing.
+    """Return r^2, where only rays through the ellipsoid scaled by r can reach the optical depth ``least``.
 
-    ``most`` is b2 + sum |w2|, and ``longest`` bounds half chords in units of the longest semi-axis. The result is
-    rounded to float32, so that backends agree.
+    r^2 is 1 for the whole ellipsoid and 0 if no ray can. ``most`` is b2 + sum |w2|, and ``longest`` bounds half chords
+    in units of the longest semi-axis. The result is rounded to float32, so that backends agree.
     """
     share = least / (most * NORMS[edge] * longest)
     if share >= 1.0:
@@ -124,7 +131,7 @@ def _visible_square(most, longest, edge, least):  # type: ignore[no-untyped-def]
 
 @strict
 def _is_finite_undrawn_primitive(i, parameters, most):  # type: ignore[no-untyped-def]
-    """Return whether a primitive that is not drawn has finite parameters; ``most`` includes its amplitudes."""
+    """Return whether all parameters of a primitive that is not drawn are finite; ``most`` is b2 + sum |w2|."""
     means, log_scales, quats, W1, b1, _, _ = parameters
     total, square = most, np.float64(0.0)
     for a in range(3):
@@ -138,10 +145,10 @@ def _is_finite_undrawn_primitive(i, parameters, most):  # type: ignore[no-untype
 
 @strict
 def _silhouette_screen_extent(z, ci, s22, square, b, axes, towards, focal, middle):  # type: ignore[no-untyped-def]
-    """Return the pixel range of the silhouette, scaled by ``square`` ** 0.5, along a screen axis.
+    """Return the pixel range along a screen axis of an ellipsoid's silhouette, after scaling it by ``square`` ** 0.5.
 
-    Uses the tangents of ``screen_boxes`` in the reference, in units of m. ``b`` and ``towards`` are the rows of B for
-    the screen axis and for depth, and ``s22`` is S_zz of the whole ellipsoid.
+    Uses the tangents of ``screen_boxes`` in the reference, in units of m. ``b`` and ``towards`` are the rows of B (the
+    orientation in camera axes) for the screen axis and for depth, and ``s22`` is S_zz of the unscaled ellipsoid.
     """
     (b0, b1, b2), (s0, s1, s2), (d0, d1, d2), szz = b, axes, towards, square * s22
     sii = square * ((b0 * s0) ** 2 + (b1 * s1) ** 2 + (b2 * s2) ** 2)
@@ -153,10 +160,10 @@ def _silhouette_screen_extent(z, ci, s22, square, b, axes, towards, focal, middl
 
 @strict
 def _longest_half_chord(c, m, reach, tc, fx, fy, e_length, ex_length, ey_length):  # type: ignore[no-untyped-def]
-    """Return an upper bound, <= 1, of the half chords of all rays, in units of the longest semi-axis.
+    """Return an upper bound, <= 1, of the half chords of all rays, in units of the longest semi-axis m.
 
-    A ray's half chord through the centre is m / |e|. No point is farther than m from the centre, which bounds the
-    slopes. The bound is 1 where the anchor is not the centre.
+    A ray of direction e through the centre has half chord m / |e|. No point is farther than m from the centre, which
+    bounds the slopes of the rays. The bound is 1 where the anchor is not the centre.
     """
     u, v, wide = abs(c[0] / c[2]), abs(c[1] / c[2]), m / (c[2] - reach)
     du, dv = wide * (1.0 + u), wide * (1.0 + v)
@@ -172,7 +179,10 @@ def _cross(a, b):  # type: ignore[no-untyped-def]
 
 @strict
 def _moment_slope(x, e, axis, tc):  # type: ignore[no-untyped-def]
-    """Return the derivative of the ray's moment, the cross product of x and e, along a screen axis."""
+    """Return the derivative of a ray's moment (point x cross direction e) by the pixel offset along a screen axis.
+
+    ``axis`` is the derivative of e, and ``tc`` times ``axis`` that of x.
+    """
     a, b = _cross(x, axis), _cross(axis, e)
     return a[0] + tc * b[0], a[1] + tc * b[1], a[2] + tc * b[2]
 
@@ -184,7 +194,7 @@ def _rounded(x):  # type: ignore[no-untyped-def]
 
 @strict
 def _bound_block(S, view, edge, least):  # type: ignore[no-untyped-def]
-    """Fill silhouettes, boxes, status and FLOAT64 of the primitives of a block."""
+    """Fill silhouettes, pixel boxes and status of a block of primitives, and whether each needs float64."""
     fx, fy, cx, cy, near = view.fx, view.fy, view.cx, view.cy, view.near
     width, height, soft = float(view.width), float(view.height), edge > 0
     for k in range(BLOCK):
@@ -271,7 +281,7 @@ def _bound_block(S, view, edge, least):  # type: ignore[no-untyped-def]
 
 @exact_kernel
 def prepare_wide(start, stop, which, parameters, view, order, wide):  # type: ignore[no-untyped-def]
-    """Fill the float64 rows of primitives ``which[start:stop]``, which the pixel stage draws in float64."""
+    """Fill the float64 rows of primitives ``which[start:stop]``, whose pixels are computed in float64."""
     parameters, view, own = borrow_arrays(parameters), borrow_arrays(view), allocate_block(parameters.W1.shape[1])
     S, waves, rate, block = borrow_arrays(own)
     for first in range(start, stop, BLOCK):
@@ -305,9 +315,9 @@ def _store_block(block, n, S, waves, rate, out):  # type: ignore[no-untyped-def]
 
 @exact_kernel
 def prepare_primitives(start, stop, parameters, view, edge, least, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` for primitives ``start:stop``; silhouettes bound the rays that reach optical depth ``least``.
+    """Project primitives ``start:stop``; fill ``out``. Silhouettes contain all rays that reach optical depth ``least``.
 
-    A primitive that no such ray hits gets only a status, an empty box and a depth of 0.
+    A primitive that is too faint for any ray to reach that depth gets only a status, an empty box and a depth of 0.
     """
     parameters, view, out = borrow_arrays(parameters), borrow_arrays(view), borrow_arrays(out)
     w2, b2, boxes = parameters.w2, parameters.b2, out.boxes

@@ -1,4 +1,7 @@
-"""Backward pass of the per-primitive stage: from gradient rows to parameter gradients, in float64, by blocks."""
+"""Backward pass of the projection of primitives: from gradient rows to parameter gradients, in float64, by blocks.
+
+A gradient row holds the gradients by the numbers of a primitive's row. A block is 32 primitives.
+"""
 
 from __future__ import annotations
 
@@ -40,9 +43,10 @@ _COLUMNS = COLUMNS + 56
 
 @strict
 def _axis_gradient(b, s, g, reference, w, fx, fy):  # type: ignore[no-untyped-def]
-    """Return dL/d(column of B), dL/d(log of its axis s), and this axis's part of -m dL/d centre.
+    """Return dL/d(column of B), dL/d(log semi-axis s) and the part of -m dL/d(centre) for one axis of an ellipsoid.
 
-    ``g`` is dL/d(E0, EX, EY, XA) along this axis, ``b`` its column of B, and ``s`` its length over m.
+    B is the orientation in camera axes. ``g`` is dL/d(E0, EX, EY, XA), the numbers of the rays, along this axis; ``b``
+    is the axis's column of B, and ``s`` its length over m.
     """
     a = b[0] / s, b[1] / s, b[2] / s
     gx = g[3]
@@ -54,7 +58,7 @@ def _axis_gradient(b, s, g, reference, w, fx, fy):  # type: ignore[no-untyped-de
 
 @strict
 def _rays_backward(S, view):  # type: ignore[no-untyped-def]
-    """Fill dL/d(B, log scales, centre) of a block from dL/d rays."""
+    """Fill dL/d(orientation B, log scales, centre) of a block of primitives from the gradients by its rays."""
     fx, fy, cx, cy = view.fx, view.fy, view.cx, view.cy
     for k in range(BLOCK):
         m, c, s = S[M + k], load3(S, CENTRE, k), load3(S, AXES, k)
@@ -77,7 +81,10 @@ def _rays_backward(S, view):  # type: ignore[no-untyped-def]
 
 @strict
 def _neuron_backward(S, turns):  # type: ignore[no-untyped-def]
-    """Add one neuron's part of dL/d(log scales, local axes, log m) of a block; fill its dL/dW1."""
+    """Fill dL/dW1 of one neuron of a block of primitives; add its part of dL/d(log scales, LOCAL, log m).
+
+    LOCAL is the orientation in scene axes, m the longest semi-axis.
+    """
     for k in range(BLOCK):
         wave, W, g, s = load3(S, _WAVE, k), load3(S, _WEIGHT, k), load3(S, _G_WAVE, k), load3(S, AXES, k)
         l00, l01, l02, l10, l11, l12, l20, l21, l22 = load9(S, LOCAL, k)
@@ -97,7 +104,10 @@ def _neuron_backward(S, turns):  # type: ignore[no-untyped-def]
 
 @strict
 def _geometry_backward(S, R):  # type: ignore[no-untyped-def]
-    """Fill dL/d(means, log scales, quaternions) of a block from dL/d(B, local axes, log m, centre)."""
+    """Fill dL/d(means, log scales, quaternions) of a block of primitives, whose other gradients are complete.
+
+    These are the gradients by B and LOCAL (orientation in camera and scene axes), log m and the centre.
+    """
     x, y, z = (R[0, 0], R[1, 0], R[2, 0]), (R[0, 1], R[1, 1], R[2, 1]), (R[0, 2], R[1, 2], R[2, 2])
     for k in range(BLOCK):
         logs, g_log, log_m, c = (
@@ -132,7 +142,7 @@ def _geometry_backward(S, R):  # type: ignore[no-untyped-def]
 
 @strict
 def _backward_block(which, n, parameters, view, projected, grads, out, g_view, S):  # type: ignore[no-untyped-def]
-    """Compute parameter gradients of primitives ``which[:n]`` from their gradient rows."""
+    """Compute the parameter gradients of a block of primitives, ``which[:n]``, from their gradient rows."""
     W1, rows, order, turns = parameters.W1, projected.rows, projected.order, view.turns
     load_block(which, n, parameters, S)
     project_block(S, view)
@@ -179,10 +189,10 @@ def _backward_block(which, n, parameters, view, projected, grads, out, g_view, S
 
 @exact_kernel
 def prepare_backward(start, stop, parameters, view, projected, grads, touched, out, g_view):  # type: ignore[no-untyped-def]
-    """Compute parameter gradients of primitives ``start:stop`` from gradient rows; zeros if not ``touched``.
+    """Compute parameter gradients of primitives ``start:stop`` from gradient rows ``grads``; zeros if not ``touched``.
 
-    Fills ``out`` (:class:`PrimitiveArrays`, float32) and ``g_view`` (N, 3, 4), each primitive's part of dL/d(R | t).
-    Pass zeros as ``g_view``, or an empty array if dL/d(R | t) is not needed.
+    Fills ``out`` (:class:`PrimitiveArrays`, float32) and ``g_view`` (N, 3, 4), each primitive's part of dL/d(R | t),
+    the camera's rotation and translation. Pass zeros as ``g_view``, or an empty array if dL/d(R | t) is not needed.
     """
     parameters, view, projected = borrow_arrays(parameters), borrow_arrays(view), borrow_arrays(projected)
     grads, out, g_view = borrow_array(grads), borrow_arrays(out), borrow_array(g_view)

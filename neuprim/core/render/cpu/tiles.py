@@ -1,7 +1,8 @@
-"""Tiles of 16 x 16 pixels: the primitives that reach each tile, front to back, and the pixels of each pair.
+"""Tiles of 16 x 16 pixels: which primitives reach each tile, front to back, and which pixels of it each one covers.
 
 Forward and backward pass do the same per (tile, primitive) pair: find the pixels of each row inside the silhouette,
-gather them into a compact list of lanes, compute chords and neurons of all lanes, scatter the results back row by row.
+gather them into a compact list of lanes (one per pixel), compute chords and neurons of all lanes, scatter the results
+back row by row.
 """
 
 from __future__ import annotations
@@ -73,7 +74,8 @@ def depth_order(depth: NDArray[np.float64]) -> NDArray[np.int64]:
 def _reached_tiles(start, stop, projected, across, first):  # type: ignore[no-untyped-def]
     """Return the tiles that the silhouettes of primitives ``start:stop`` reach, with a margin of 1e-3 pixels.
 
-    ``first[i + 1]`` gets the number of tiles of primitive i. Primitives are in memory order, not in depth order.
+    The tiles of each primitive follow each other, in the order of primitive indices. ``first[i + 1]`` gets the number
+    of tiles of primitive i.
     """
     rows, spans, boxes, status = projected.rows, projected.spans, projected.boxes, projected.status
     tiles, n = np.empty(4096, np.int32), 0
@@ -114,7 +116,10 @@ def _reached_tiles(start, stop, projected, across, first):  # type: ignore[no-un
 
 @exact_kernel
 def _sort_pairs_by_tile(order, first, tiles, starts, ids, slots):  # type: ignore[no-untyped-def]
-    """Sort pairs by tile with a counting sort, in depth order of primitives: each tile's list is front to back."""
+    """Sort (tile, primitive) pairs by tile, with a counting sort, so that each tile's list is front to back.
+
+    ``order`` has the primitives from front to back. Fills ``starts``, ``ids`` and ``slots`` of :class:`TileLists`.
+    """
     for k in range(tiles.shape[0]):
         starts[tiles[k] + 1] += 1
     for t in range(starts.shape[0] - 1):
@@ -173,7 +178,10 @@ class FrameArrays(NamedTuple):
 
 
 class PairWindow(NamedTuple):
-    """Columns x0:x1 and rows y0:y1 of tile (tx, ty) in primitive i's box; (fx0, fy0) is tile corner minus anchor."""
+    """The pixels of a tile with corner (tx, ty) in primitive i's box: columns x0:x1 and rows y0:y1 of the tile.
+
+    (fx0, fy0) is the offset of the tile's first pixel centre from the primitive's anchor.
+    """
 
     i: int
     tx: int
@@ -197,7 +205,7 @@ def pair_window(frame, i, tx, ty):  # type: ignore[no-untyped-def]
 
 @inline
 def box_pixels(frame, i, tx, ty):  # type: ignore[no-untyped-def]
-    """Return how many pixels of a tile are in the box of primitive ``i``: an upper bound of the pair's lanes."""
+    """Return how many pixels of a tile lie in the pixel box of primitive ``i``; (tx, ty) is the tile's first pixel."""
     box = frame.boxes[i]
     wide = min(box[2] - tx, P.TILE) - max(box[0] - tx, 0)
     high = min(box[3] - ty, P.TILE) - max(box[1] - ty, 0)
@@ -206,14 +214,14 @@ def box_pixels(frame, i, tx, ty):  # type: ignore[no-untyped-def]
 
 @inline
 def aligned_tile_zeros(floats):  # type: ignore[no-untyped-def]
-    """Return zeros aligned to a cache line; numba aligns to 32 bytes, and a vector across two lines costs twice."""
+    """Return float32 zeros aligned to a cache line; numba aligns to 32 bytes, and a vector in two lines costs twice."""
     room = np.zeros(floats + 16, np.float32)
     shift = -(np.int64(room.ctypes.data) // 4) % 16
     return room[shift : shift + floats]
 
 
 def _emit_prefetch(context, address):  # type: ignore[no-untyped-def]
-    """Prefetch the cache line at an address. Nothing is read, so any address is allowed."""
+    """Generate code that prefetches the cache line at an address. Nothing is read, so any address is allowed."""
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         byte, i32 = ir.IntType(8).as_pointer(), ir.IntType(32)
@@ -231,7 +239,7 @@ _prefetch: Any = intrinsic(_emit_prefetch)
 
 @inline
 def prefetch_pair(i, frame):  # type: ignore[no-untyped-def]
-    """Prefetch the data that the next pair, of primitive ``i``, reads first."""
+    """Prefetch what the next (tile, primitive) pair reads first: row, silhouette and box of primitive ``i``."""
     rows, spans, boxes = frame.rows, frame.spans, frame.boxes
     row = rows.ctypes.data + i * rows.strides[0]
     for at in range(0, rows.strides[0], 64):
@@ -242,14 +250,14 @@ def prefetch_pair(i, frame):  # type: ignore[no-untyped-def]
 
 @inline
 def prefetch_lane_depths(depths, first, stop):  # type: ignore[no-untyped-def]
-    """Prefetch the optical depths of a pair's lanes ``first:stop``."""
+    """Prefetch the optical depths of lanes (pixels) ``first:stop``."""
     for at in range(first, stop, 16):
         _prefetch(depths.ctypes.data + 4 * at)
 
 
 @inline
 def row_spans(span, pair, rows_live, bounds):  # type: ignore[no-untyped-def]
-    """Fill, for each unfinished tile row y, the pixels [bounds[y], bounds[y + 16]) inside the silhouette."""
+    """Find, for each unfinished row y of a tile, its pixels [bounds[y], bounds[y + 16]) inside the silhouette."""
     skew, xc, yc, hx = span[P.SKEW], span[P.XC] - pair.fx0, span[P.YC] - pair.fy0, span[P.HX]
     ihy = f(1) / span[P.HY]
     low, high, top, bottom = f(pair.x0), f(pair.x1), f(pair.y0), f(pair.y1)
@@ -270,10 +278,10 @@ def row_spans(span, pair, rows_live, bounds):  # type: ignore[no-untyped-def]
 
 @inline
 def compact_lanes(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-def]
-    """Gather pixels and their ray norms into lanes; row y starts at ``offset[y]``. Return the number of lanes.
+    """Gather the pixels inside a silhouette, and their ray norms, into lanes; return the number of lanes.
 
-    Padding is the first lane's pixel with a norm of 0. Every row copies a whole vector without a branch; the next row,
-    or the padding, overwrites the excess.
+    Row y of the tile starts at lane ``offset[y]``. Padding is the first lane's pixel with a norm of 0. Every row copies
+    a whole vector without a branch; the next row, or the padding, overwrites the excess.
     """
     n = 0
     for y in range(y0, y1):
@@ -292,9 +300,10 @@ def compact_lanes(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-
 
 @inline
 def lane_chords(S, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
-    """Fill chord middle Q, direction E and half length of n lanes; HALF = 0 where the ray misses.
+    """Compute the chords (rays inside the primitive) of n lanes (pixels): middle Q, direction E, half length HALF.
 
-    The near plane must not cut a soft-edged chord: such primitives are drawn in float64.
+    HALF is 0 where the ray misses. The near plane must not cut a soft-edged chord: such primitives are drawn in
+    float64.
     """
     p, fx0, fy0, depth_floor = frame.rows[pair.i], pair.fx0, pair.fy0, frame.depth_floor
     row, offset = load_ray(p), p[P.OFFSET]
@@ -323,7 +332,7 @@ def lane_chords(S, n, frame, pair, with_mid, backward, edge):  # type: ignore[no
 
 
 def _neuron_values(profiles):  # type: ignore[no-untyped-def]
-    """Return a function that adds w2 cos(phase at middle) B_p(rate x half chord) of two neurons to FIELD."""
+    """Return a function that adds w2 cos(phase at middle) B_p(rate x half chord), two neurons' means, to FIELD."""
 
     @inline
     def add(S, n, p, o, edge):  # type: ignore[no-untyped-def]
@@ -353,7 +362,10 @@ _values_fast = _neuron_values(profiles_fast)
 
 @inline
 def chord_field_values(S, D, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
-    """Fill chords and FIELD of ``n`` lanes of a pair, in float64 if necessary; see :func:`lane_chords`."""
+    """Compute chords of ``n`` lanes (pixels) and FIELD, the mean of the density network over each chord.
+
+    Uses float64 if the primitive needs it. For the arguments see :func:`lane_chords`.
+    """
     i = pair.i
     if frame.slots[i] >= 0:
         cut = chords_float64(S, D, n, frame, pair, with_mid, backward, edge)

@@ -130,7 +130,7 @@ def frame_counts(stats: RenderStats) -> tuple[int, int, int, int]:
 def render_slabs(
     lowered: LoweredPrimitives, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
-    """Render all slabs as one frame; return opacity and depth. See :func:`neuprim.core.render.render_slabs`."""
+    """Render all slabs (groups of primitives) as one frame; see :func:`neuprim.core.render.render_slabs`."""
     means, settings = lowered.geometry.means, replace(settings, depth=True)
     tensors = rasterizer_tensors(lowered)
     blank = torch.zeros(len(means), 1, device=means.device)

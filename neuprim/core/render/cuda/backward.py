@@ -1,10 +1,11 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Backward pass of compositing. A slot holds the data that the forward pass saved for one pixel of a pair.
 
-First kernel, one block per tile, one thread per pixel: visit the hits back to front, and store dL/dI and the weight in
-each slot. Second kernel, one warp per (tile, primitive) pair: recompute chord and neurons, sum in registers, and write
-one gradient row. A primitive's rows are added in the order of its pairs, so reruns give the same bits. With 8 neurons
-the sums take 59 of 128 registers, so the kernel recomputes cheap values instead of keeping them in registers.
+First kernel, one block per tile, one thread per pixel: visit the hits (primitives on the pixel's ray) back to front,
+and store dL/dI, I the optical depth, and the weight in each slot. Second kernel, one warp per (tile, primitive) pair:
+recompute chord and neurons, sum in registers, and write one gradient row. A primitive's rows are added in the order of
+its pairs, so reruns give the same bits. With 8 neurons the sums take 59 of 128 registers, so the kernel recomputes
+cheap values instead of keeping them in registers.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ from neuprim.core.settings import RenderSettings
 
 @functools.cache
 def pixels_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return the first backward kernel, for pixels; with ``depth``, the sum of weight x depth has a gradient, too."""
+    """Return the first backward kernel, one thread per pixel; with ``depth``, the depth image has a gradient, too."""
     C, H = form.channels, form.hidden
     colours, width = L.rasterizer_colour_column(form.neurons), L.rasterizer_row_columns(form.neurons, C)
     vecC = wp.types.vector(length=C, dtype=wp.float32)
@@ -82,7 +83,7 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
         transmittance: Floats, reached: Ints, background: Floats, g_rgb: Floats2d, g_transmittance: Floats, g_z: Floats,
         depths: Floats, hues: Floats2d, hits: Vec2s,
     ):  # fmt: skip
-        """Store dL/dI = (1 - alpha) T dL/dw - b, I the optical depth, and the weight w in each slot.
+        """Store the weight w and dL/dI = (1 - alpha) T dL/dw - b in each slot, I the optical depth of the hit.
 
         b, the light behind the hit, is the sum of w dL/dw of later hits and T dL/dT.
         """
@@ -138,7 +139,7 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
 
 @functools.cache
 def pairs_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return the second backward kernel, for pairs; with ``depth``, the sum of weight x depth has a gradient, too."""
+    """Return the second backward kernel, with a warp per pair; with ``depth``, the depth image has a gradient, too."""
     K, P, C = form.neurons, form.edge, form.channels
     W, width = L.rasterizer_row_columns(K, C), L.gradient_width(K, C)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)
@@ -287,7 +288,7 @@ def sum_pairs(
     first: Ints, slots: Ints, pair_rows: Floats2d,
     grads: Floats2d,
 ):  # fmt: skip
-    """Thread (i, c) sums column c of primitive i's pair rows, in the order of its pairs."""
+    """Sum the gradient rows of each primitive's pairs, in order; thread (i, c) sums column c for primitive i."""
     i, c = wp.tid()
     total = float(0.0)
     for k in range(first[i], first[i + 1]):
@@ -297,7 +298,7 @@ def sum_pairs(
 
 @functools.cache
 def uncomposite_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return a kernel like :func:`pixels_kernel`, for sorted hits; it turns slots (alpha, T) into (dL/dI, weight)."""
+    """Return a kernel like :func:`pixels_kernel` for hits sorted by entry; slots (alpha, T) become (dL/dI, weight)."""
     C, H = form.channels, form.hidden
     colours = L.rasterizer_colour_column(form.neurons)
 
@@ -349,7 +350,7 @@ def uncomposite_kernel(form: KernelForm, depth: bool) -> Any:
 
 @dataclass
 class ImageGradient:
-    """The gradient dL/d(image), float32 and contiguous, and the error of each pixel, used for contributions."""
+    """The gradient dL/d(image), float32 and contiguous, and a given error of each pixel, used for contributions."""
 
     rgb: Tensor  # (H W, C)
     transmittance: Tensor | None  # (H W,), without the background's share
@@ -368,7 +369,7 @@ def rasterizer_gradient_rows(
 ) -> tuple[Tensor, Tensor | None]:
     """Return gradient rows of primitives, (N, gradient_width), and of networks, (N, net_gradient_row_width) or None.
 
-    Overwrites the slots.
+    Overwrites the slots, in which the forward pass saved its data.
     """
     lists, device, depth = frame.lists, frame.device, gradient.z is not None
     pairs, tiles = lists.pairs, lists.starts.shape[0] - 1
@@ -411,7 +412,7 @@ def rasterizer_gradient_rows(
 
 
 def _sum_pair_rows(frame: Frame, pair_rows: Tensor) -> Tensor:
-    """Return (N, width), for each primitive the sum of its pairs' rows."""
+    """Return the (N, width) sums, for each primitive, of the gradient rows of its (tile, primitive) pairs."""
     grads = torch.empty(frame.rows.shape[0], pair_rows.shape[1], dtype=torch.float32, device=frame.device)
     lists = (warp_array(frame.lists.first), warp_array(frame.lists.slots_of))
     launch_kernel(sum_pairs, grads.shape, (*lists, warp_array(pair_rows), warp_array(grads)), frame.device)

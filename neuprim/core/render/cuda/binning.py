@@ -1,5 +1,5 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Silhouettes, tile lists and pixels per pair; the CUDA version of :mod:`neuprim.core.render.cpu.tiles`.
+"""Silhouettes, lists of primitives per tile, counts; the CUDA version of :mod:`neuprim.core.render.cpu.tiles`.
 
 Outputs are counted before they are written, and sorted by integer keys, so reruns give the same bits. The host waits
 once for the counts, unless the caller gives the sizes of the arrays (:class:`FrameCapacity`).
@@ -65,7 +65,7 @@ class FrameCapacity:
     def around(
         cls, counts: Sequence[int], refused: Tensor, zeros: bool, least: "FrameCapacity | None" = None
     ) -> "FrameCapacity":
-        """Return sizes with room beyond ``counts``, in the order of fields, and no smaller than those of ``least``.
+        """Return sizes with room beyond ``counts``, in the order of the fields, and no smaller than those of ``least``.
 
         With ``zeros``, a count of 0 gets no room.
         """
@@ -123,9 +123,9 @@ def running_sums(counts: Tensor) -> Tensor:
 
 
 def count_tiles(counts: Tensor, bad: Tensor, capacity: FrameCapacity | None = None) -> TileCounts:
-    """Return sizes and running sums of the ``counts`` of ``prepare``; waits for the device if there is no ``capacity``.
+    """Return the sizes of a frame's arrays, and running sums of ``counts`` (2, N): tiles and float64 primitives.
 
-    Raises BackendUnavailable if there are too many pairs.
+    Waits for the device if there is no ``capacity``. Raises BackendUnavailable if there are too many pairs.
     """
     ends = running_sums(counts)
     if capacity is not None:
@@ -143,13 +143,13 @@ def count_tiles(counts: Tensor, bad: Tensor, capacity: FrameCapacity | None = No
 
 @wp.func
 def projected_covariance(p: ProjectedPrimitive, i: int, j: int):
-    """Return entry (i, j) of the covariance in camera axes, in units of m^2."""
+    """Return entry (i, j) of an ellipsoid's matrix B diag(s^2) B^T in camera axes, in units of m^2; s: semi-axes."""
     return wp.dot(wp.cw_mul(p.B[i], p.B[j]), wp.cw_mul(p.axes, p.axes))
 
 
 @wp.func
 def silhouette_screen_extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.float64, square: wp.float64):
-    """Return the pixel range of the silhouette, scaled by ``square`` ** 0.5, along a screen axis."""
+    """Return the pixel range along a screen axis of an ellipsoid's silhouette, after scaling it by ``square``^0.5."""
     z, ci, szz = p.centre[2] / p.m, p.centre[axis] / p.m, square * s22
     sii, siz = square * projected_covariance(p, axis, axis), square * projected_covariance(p, axis, 2)
     D = z * z * sii - d(2.0) * ci * z * siz + ci * ci * szz - (sii * szz - siz * siz)
@@ -161,7 +161,7 @@ def silhouette_screen_extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.
 
 @wp.struct
 class SilhouetteSpans:
-    """A silhouette's row spans, hx and hy UNBOUNDED if it is no ellipse, and whether the primitive needs float64."""
+    """Shape of a silhouette per pixel row (hx, hy UNBOUNDED if it is no ellipse), and whether float64 is needed."""
 
     skew: wp.float64
     xc: wp.float64
@@ -173,7 +173,10 @@ class SilhouetteSpans:
 
 @wp.func
 def silhouette_spans(p: ProjectedPrimitive, r: Ray, width: int, height: int, square: wp.float64):
-    """Return row spans of the rays (x, e) with ``square`` |e|^2 > |x cross e|^2: centre XC + SKEW (dv - YC), HX, HY."""
+    """Return the row spans of a primitive's silhouette: the rays (x, e) with ``square`` |e|^2 > |x cross e|^2.
+
+    In the row of pixel offset dv, the span's centre is XC + SKEW (dv - YC), and its half width follows from HX and HY.
+    """
     o = SilhouetteSpans()
     o.hx = _UNBOUNDED
     o.hy = _UNBOUNDED
@@ -248,7 +251,10 @@ def is_too_faint_to_draw(most: wp.float64, edge: int, least: wp.float64):
 
 @wp.func
 def visible_square(most: wp.float64, bound: wp.float64, edge: int, least: wp.float64):
-    """Return r^2 of the visible extent, 0 to 1 (all of it); ``most`` is b2 + sum |w2|, half chords are <= ``bound``."""
+    """Return r^2, where only rays through the ellipsoid scaled by r can reach optical depth ``least``; 0: none can.
+
+    ``most`` is b2 + sum |w2|. Half chords are at most ``bound``, in units of the longest semi-axis.
+    """
     square, share = d(0.0), least / (most * _chord_bound_by_edge(edge, _N0, _N1, _N2) * bound)
     if share <= _chord_bound_by_edge(edge, _W0, _W1, _W2):
         square = d(1.0)
@@ -259,7 +265,7 @@ def visible_square(most: wp.float64, bound: wp.float64, edge: int, least: wp.flo
 
 @wp.struct
 class Ellipse:
-    """A silhouette on the screen, from the float32 values that the pixel kernels read; ``box`` in pixels."""
+    """A primitive's silhouette on the screen, from the float32 values that pixel kernels read; ``box`` in pixels."""
 
     box: wp.vec4i
     bounded: wp.int32
@@ -310,14 +316,14 @@ def tile_range(e: Ellipse, ty: int):
 
 @wp.func
 def _primitives_fit(ends: Longs2d, pairs: int, which: Ints):
-    """Return whether all pairs and all float64 primitives of a frame fit into its arrays."""
+    """Return whether a frame's (tile, primitive) pairs and its float64 primitives fit into the arrays."""
     last = ends.shape[1] - 1
     return ends[0, last] <= wp.int64(pairs) and ends[1, last] <= wp.int64(which.shape[0])
 
 
 @functools.cache
 def _binning_kernels(short: bool) -> tuple[Any, Any]:
-    """Return the kernels that write keys and read them; ``short`` keys are int32, which sort in half the time."""
+    """Return the kernels that write and read the sort keys; ``short`` keys are int32, which sort in half the time."""
     number = wp.int32 if short else wp.int64
     Keys: Any = wp.array(dtype=number)
 
@@ -326,7 +332,7 @@ def _binning_kernels(short: bool) -> tuple[Any, Any]:
         rows: Vec4s2d, spans: Vec4s2d, boxes: Vec4is, order: Longs, counts: Ints2d, ends: Longs2d, across: int,
         images: Ints, tiles: int, first: Ints, keys: Keys, slots: Ints, which: Ints,
     ):  # fmt: skip
-        """Thread ``rank`` writes the keys tile x N + rank, one per tile that the primitive of this depth rank reaches.
+        """Write one key, tile x N + rank, per tile that a primitive reaches; thread ``rank`` handles that depth rank.
 
         N is the number of primitives; ``tiles`` is the number of tiles per image, or 0 for one image.
         """
@@ -358,7 +364,7 @@ def _binning_kernels(short: bool) -> tuple[Any, Any]:
         keys: Keys, came_from: Longs, order: Longs, ends: Longs2d, which: Ints, tiles: int, each: int,
         starts: Ints, ids: Ints, tile_of: Ints, slots_of: Ints,
     ):  # fmt: skip
-        """Thread k fills the lists from sorted key k; ``tiles`` counts the tiles of all images, ``each`` of one."""
+        """Fill the tile lists from sorted keys, one per thread; ``tiles``: tiles of all images, ``each``: of one."""
         k = wp.tid()
         pairs = int(0)
         if _primitives_fit(ends, keys.shape[0], which):
@@ -392,9 +398,10 @@ def bin_primitives(
     camera: Camera,
     images: tuple[Tensor, int] | None = None,
 ) -> tuple[TileLists, Tensor, Tensor]:
-    """Return a frame's tile lists, ``slots`` and ``which``, from what ``prepare`` and :func:`count_tiles` filled.
+    """Return a frame's tile lists, and ``slots`` and ``which`` of the primitives that are drawn in float64.
 
-    ``images`` holds each primitive's image index, (N,) int32, and the number of images; None means one image.
+    ``slots`` (N,) has each primitive's float64 row or -1, ``which`` the primitive of each row. ``images`` holds each
+    primitive's image index, (N,) int32, and the number of images; None means one image.
     """
     device, N, pairs = rows.device, depth.shape[0], counted.pairs
     across, down = -(-camera.width // L.TILE), -(-camera.height // L.TILE)

@@ -2,7 +2,7 @@
 """Native functions of the kernels: operations across a block of threads, and fast loads of array elements.
 
 Every thread of a block must call a block operation. On the CPU, a static buffer replaces the hardware. Indexing in Warp
-takes nine instructions to load a span, as Warp allows negative indices and 64-bit strides. In loops over hits, indices
+allows negative indices and 64-bit strides, so it takes nine instructions to load a span. In loops over hits, indices
 are not negative and arrays are contiguous, so two instructions suffice (:func:`neuprim.core.compute.warp.array`).
 """
 
@@ -37,8 +37,8 @@ def any_tile_thread(yes: int) -> int:
 def _halving_sums(width: int) -> str:
     """Return native code that sums ``width`` values over a warp: 31 shuffles per 32 values instead of 160.
 
-    Each step keeps half of the values and adds those of a partner lane. With m = width/32, lane l ends with the sums
-    l m to l m + m - 1. Loops have constant bounds, so that they are unrolled.
+    Each step keeps half of the values and adds to them those of a partner lane (thread). With m = width/32, lane l ends
+    with the sums l m to l m + m - 1. Loops have constant bounds, so that they are unrolled.
     """
     steps = ""
     for bit in (16, 8, 4, 2, 1):
@@ -74,13 +74,16 @@ def _halving_sums(width: int) -> str:
 
 @functools.cache
 def gradient_row_type(width: int) -> Any:
-    """Return the type of a gradient row of ``width`` values in registers."""
+    """Return the Warp type of a gradient row (gradients of one pair of tile and primitive), ``width`` floats."""
     return wp.types.vector(length=width, dtype=wp.float32)
 
 
 @functools.cache
 def gradient_row_sums(width: int) -> Callable[..., Any]:
-    """Return a function (x, lane, out, pair) that sums x over a warp into row ``pair``; ``width``: a multiple of 32."""
+    """Return a function (x, lane, out, pair) that sums row x over a warp's lanes and writes it to row ``pair``.
+
+    ``width``, the length of a row, is a multiple of 32.
+    """
     row = gradient_row_type(width)
 
     @wp.func_native(_halving_sums(width))
@@ -104,7 +107,7 @@ def pixel_row_float(numbers: Floats, row: int, width: int, column: int) -> float
 
 @wp.func_native(f"return spans.data[size_t(pair) * {TILE} + y];")
 def span_of(spans: Shorts2d, pair: int, y: int) -> int:
-    """Return the span of pair ``pair`` in tile row ``y``, see :func:`~neuprim.core.render.cuda.slots.row_spans`."""
+    """Return which pixels of tile row ``y`` a pair covers; see :func:`~neuprim.core.render.cuda.slots.row_spans`."""
 
 
 @wp.func_native("return rows.data[size_t(row) * size_t(width) + column];")

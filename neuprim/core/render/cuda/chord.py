@@ -1,10 +1,10 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""The integral along one pixel's chord, forward and backward: the formulas of the cpu backend with Warp vectors.
+"""The integral along one pixel's chord (ray inside an ellipsoid), with gradients: the cpu backend's formulas in Warp.
 
-The optical depth is I = N_p |d| D^p half field. field is the mean of the density's numerator, weighted by the edge.
-cos and B_p of a phase in turns are polynomials up to half a turn, and recursions beyond
-(:mod:`neuprim.core.model.edge`). B_p' = -z B_(p+1)/(2p + 3): the backward pass also needs B_(p+1). Coefficients:
-tools/fit_polynomials.py.
+The optical depth is I = N_p |d| D^p half field. N_p normalises the edge, |d| is the length of the ray direction whose
+camera-z is 1, and D is 1 - |y|^2 at the middle. field is the mean of the density's numerator, weighted by the edge. cos
+and B_p of a phase in turns are polynomials up to half a turn, and recursions beyond (:mod:`neuprim.core.model.edge`).
+B_p' = -z B_(p+1)/(2p + 3): the backward pass also needs B_(p+1). Coefficients: tools/fit_polynomials.py.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ BANDS = (
     (1.0, -2.8198859691619873, 3.0923008918762207, -1.84883451461792, 0.6952810883522034, -0.15978121757507324),
     (1.0, -2.1932449340820312, 1.967841386795044, -0.9956727027893066, 0.32511693239212036, -0.06681565195322037),
 )  # fmt: skip
-"""B_0 to B_3 of v^2, lowest power first."""
+"""Coefficients of B_0(2 pi v) to B_3(2 pi v) as polynomials in v^2, lowest power first."""
 
 _C0, _C1, _C2, _C3, _C4, _C5, _C6 = COSINE
 
@@ -38,7 +38,7 @@ Function = Callable[..., Any]
 
 @wp.func
 def cos_turns(y: float):
-    """Return cos(2 pi r) of y = r^2, |r| <= 1/2."""
+    """Return cos(2 pi r) from y = r^2, |r| <= 1/2."""
     return (((((_C6 * y + _C5) * y + _C4) * y + _C3) * y + _C2) * y + _C1) * y + _C0
 
 
@@ -63,7 +63,7 @@ def sin_turns(r: float):
 
 
 def chord_edge_profiles(edge: int) -> tuple[Function, Function]:
-    """Return Warp functions v -> B_p(2 pi v) and v -> (B_p, B_(p+1)) of p = ``edge``, 0 to 2, for any rate v."""
+    """Return Warp functions v -> B_p(2 pi v) and v -> (B_p, B_(p+1)) for edge exponent p = ``edge`` and any rate v."""
     low, high = _B[edge], _B[edge + 1]
 
     @wp.func
@@ -123,7 +123,10 @@ class Ray:
 
 @wp.struct
 class Chord:
-    """A pixel's ray in whitened space. t is in units of m, from an origin moved along the ray by ``slide``."""
+    """The part of a pixel's ray inside a primitive, in whitened space (where the primitive is the unit sphere).
+
+    t is in units of m, from an origin moved along the ray by ``slide``.
+    """
 
     du: float  # pixel offset from the anchor
     dv: float
@@ -201,7 +204,11 @@ class Pull:
 def chord_ends_backward(
     c: Chord, g_half: float, g_mid: float, g_tm: float, gD: float, gA: float, gq: wp.vec3, gv: wp.vec3
 ):
-    """Return dL/d(m, e) from gradients by half, mid, chord middle (gq), half e (gv), ...; gD includes dL/dh dh/dD."""
+    """Return dL/dm and dL/de of a ray with origin m and direction e, from the gradients of its chord.
+
+    ``gq`` is dL/d(chord's middle point), and ``gv`` dL/d(half e). The other arguments are gradients by half chord,
+    middle, tm, D and a = e.e; ``gD`` includes dL/dh dh/dD.
+    """
     gt1 = 0.5 * (g_mid + g_half)
     gt0 = 0.5 * (g_mid - g_half) * c.uncut
     tm = g_tm + gt0 + gt1
@@ -217,7 +224,7 @@ def chord_ends_backward(
 
 @wp.func
 def chord_backward(c: Chord, g_half: float, g_mid: float, gD: float, by_depth: float, gq: wp.vec3, gv: wp.vec3):
-    """Like :func:`chord_ends_backward`, with dh/dD = ``by_depth``, and no gradient by tm and a."""
+    """Like :func:`chord_ends_backward`, with ``by_depth`` = dh/dD given apart, and no gradients by tm and a = e.e."""
     gt1 = 0.5 * (g_mid + g_half)
     gt0 = 0.5 * (g_mid - g_half) * c.uncut
     return chord_ends_backward(c, g_half, g_mid, 0.0, gD + (gt1 - gt0) * by_depth, 0.0, gq, gv)
@@ -231,7 +238,10 @@ def pixel_of_lane(lane: int):
 
 @wp.func
 def slot_of_pixel(span: int, offset: int, x: int):
-    """Return the slot of pixel x in a tile row; -1 outside the row's span (start << 8 | last << 4 | first)."""
+    """Return the slot of pixel x in a tile row; -1 outside the row's span (start << 8 | last << 4 | first).
+
+    ``offset`` is the first slot of the (tile, primitive) pair.
+    """
     slot = int(-1)
     if x >= (span & 15) and x <= ((span >> 4) & 15):
         slot = offset + (span >> 8) + x - (span & 15)
@@ -240,7 +250,10 @@ def slot_of_pixel(span: int, offset: int, x: int):
 
 @wp.func
 def pixel_of_slot(spans: Any, n: int, s: int):
-    """Return (x, y) in the tile of slot ``s`` of pair ``n``: y is the last row whose span starts at or before s."""
+    """Return (x, y) in the tile of slot ``s`` of pair ``n``, from row spans (start << 8 | last << 4 | first).
+
+    y is the last row whose span starts at or before s.
+    """
     y = int(0)
     for b in range(4):
         if int(spans[n, y + (8 >> b)]) >> 8 <= s:

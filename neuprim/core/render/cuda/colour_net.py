@@ -1,9 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Colour networks, per primitive and at pixels; the CUDA version of :mod:`neuprim.core.render.cpu.colour_net`.
 
-The per-primitive stage is in float64. A slot (one pixel of a pair) has a hue, the colour before max(0, .), which the
-forward pass saves. The network's gradient reaches a ray only through the chord's middle. It is added to the density's
-row.
+The per-primitive stage is in float64. A slot (one pixel of a (tile, primitive) pair) has a hue, the colour before
+max(0, .), which the forward pass saves. The gradient of a network reaches a ray only through the chord's middle, and is
+added to the gradient row of the density.
 """
 
 import functools
@@ -55,8 +55,8 @@ from neuprim.core.render.cuda.prepare_backward import quaternion_gradient
 from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK, View, project_primitive
 
 FIRST_COLOUR = L.G_NEURONS
-"""Column of a network's gradient row where the C bases begin. The columns of the ray come before, and (WX, WY, WZ,
-PHASE, C weights) of each unit after."""
+"""First column of a network's gradient row with the C constant colours. The columns of the ray come before, the columns
+(WX, WY, WZ, PHASE, C weights) of each unit after."""
 
 d, f = wp.float64, wp.float32
 _TURNS = wp.constant(d(1.0 / (2.0 * math.pi)))
@@ -82,7 +82,7 @@ class ColourNet:
 
 @wp.func
 def _whitened_unit(log_scale: wp.vec3d, quat: wp.vec4d, w: wp.vec3d, phase: wp.float64):
-    """Return (WX, WY, WZ, PHASE) of a network unit, converted to whitened axes and turns."""
+    """Return (WX, WY, WZ, PHASE) of a network unit: frequencies in units of the semi-axes, and the phase, in turns."""
     p = project_primitive(wp.vec3d(), log_scale, quat, View())
     on_axes = _TURNS * wp.cw_mul(p.axes, wp.transpose(p.local) * w)
     turns = _TURNS * phase
@@ -99,7 +99,7 @@ def _colour_net_kernels(double: bool) -> tuple[Any, Any, Any]:
         bias: wp.array2d(dtype=real),
         Wout: wp.array3d(dtype=real), channels: int, rows: Vec4s2d, fast: Bools2d,
     ):  # fmt: skip
-        """Thread (i, j) fills the row of unit j of primitive i."""
+        """Fill the float32 rows of the colour networks; thread (i, j) handles unit j of primitive i."""
         i, j = wp.tid()
         unit = _whitened_unit(wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), wp.vec3d(Wx[i, j]), d(bias[i, j]))
         fast[i, j] = unit[0] * unit[0] + unit[1] * unit[1] + unit[2] * unit[2] > _FAST
@@ -117,7 +117,7 @@ def _colour_net_kernels(double: bool) -> tuple[Any, Any, Any]:
         which: Ints, log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4), Wx: wp.array2d(dtype=vec3),
         bias: wp.array2d(dtype=real), wide: Vec4ds2d,
     ):  # fmt: skip
-        """Thread (m, j) fills the float64 row of unit j of primitive ``which[m]``."""
+        """Fill the float64 rows of the colour networks; thread (m, j) handles unit j of primitive ``which[m]``."""
         m, j = wp.tid()
         i = which[m]
         wide[m, j] = _whitened_unit(wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), wp.vec3d(Wx[i, j]), d(bias[i, j]))
@@ -128,9 +128,9 @@ def _colour_net_kernels(double: bool) -> tuple[Any, Any, Any]:
         channels: int, weights: Floats2d, grads: Floats2d, first: int, g_log_scales: Vec3s, g_quats: Vec4s,
         g_Wx: Vec3s2d, g_bias: Floats2d, g_Wout: Floats3d,
     ):  # fmt: skip
-        """Thread i computes the parameter gradients of primitive i, visible if ``weights[i, G_WEIGHT]`` > 0.
+        """Compute the parameter gradients of the colour networks; thread i handles primitive i.
 
-        Adds to g_log_scales and g_quats; overwrites the other gradients.
+        A primitive is visible if ``weights[i, G_WEIGHT]`` > 0. Adds to g_log_scales and g_quats; overwrites the others.
         """
         i = wp.tid()
         seen = weights[i, wp.static(L.G_WEIGHT)] > f(0.0)
@@ -176,7 +176,7 @@ def _kernel_types(double: bool) -> tuple[Any, Any, Any]:
 def prepare_rasterizer_colour_net(
     log_scales: Tensor, quats: Tensor, Wx: Tensor, bias: Tensor, Wout: Tensor
 ) -> ColourNet:
-    """Return the networks with the rows of all primitives. ``wide`` stays empty until :func:`fill_wide_net`."""
+    """Return all primitives' colour networks as float32 rows. ``wide`` stays empty until :func:`fill_wide_net`."""
     tensors = (log_scales, quats, Wx, bias, Wout)
     double = any(x.dtype == torch.float64 for x in tensors)
     dtype = torch.float64 if double else torch.float32
@@ -196,7 +196,7 @@ def prepare_rasterizer_colour_net(
 
 
 def fill_wide_net(net: ColourNet, which: Tensor, log_scales: Tensor, quats: Tensor) -> None:
-    """Fill ``net.wide``, float64 rows, for primitives ``which`` (M,) int32."""
+    """Fill ``net.wide``, the float64 network rows of the primitives ``which`` (M,) int32 that are drawn in float64."""
     M, H, device = len(which), net.hidden, net.Wx.device
     double = net.Wx.dtype == torch.float64
     real, vec3, vec4 = _kernel_types(double)
@@ -216,7 +216,7 @@ def colour_net_backward(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the float32 gradients of Wx, bias and Wout; add the gradients of log_scales and quats to ``out``.
 
-    ``weights`` has the (N, ...) gradient rows of the density, ``grads`` those of the networks.
+    ``weights`` has the (N, ...) gradient rows of the density, ``grads`` those of the networks, one per primitive.
     """
     _, log_scales, quats, *_ = parameters
     _, g_log_scales, g_quats, *_ = out
@@ -240,13 +240,13 @@ def colour_net_backward(
 
 
 def net_gradient_row_width(form: KernelForm) -> int:
-    """Return the number of columns of a network's gradient row."""
+    """Return the number of columns of a colour network's gradient row (gradients of one primitive's network)."""
     return L.gradient_width(0, form.channels, form.hidden)
 
 
 @functools.cache
 def rasterizer_net_gradient_kernel(form: KernelForm) -> Any:
-    """Return a kernel, one warp per pair, for gradients of the network and, through the chord's middle, of the ray."""
+    """Return a kernel, one warp per pair, for gradients of colour networks and, through chord middles, of the rays."""
     C, H, P = form.channels, form.hidden, form.edge
     each, width = L.rasterizer_net_columns(C), net_gradient_row_width(form)
     columns, net_columns = L.rasterizer_row_columns(form.neurons, C), max(H * each, 1)
@@ -322,14 +322,14 @@ def rasterizer_net_gradient_kernel(form: KernelForm) -> Any:
 
 @functools.cache
 def float64_hues_kernel(channels: int) -> Any:
-    """Return a kernel that fills the hues of the float64 pairs' slots, in float64."""
+    """Return a kernel that computes, in float64, the hues (colours before max(0, .)) of the slots of float64 pairs."""
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def float64_hues(
         pairs: Ints, wide: Doubles2d, net: Vec4ds2d, mixes: Vec4s2d, rows: Vec4s2d, first: int, hidden: int,
         slots: Ints, ids: Ints, tiles: Ints, spans: Shorts2d, offsets: Ints, size: wp.vec2i, hues: Floats2d,
     ):  # fmt: skip
-        """Fill ``hues``; output weights are from ``mixes``, constant colours from column ``first`` of ``rows``."""
+        """Fill ``hues``. Units' output weights are in ``mixes``, constant colours in ``rows`` from column ``first``."""
         member, lane = wp.tid()
         n = pairs[member]
         i, r = ids[n], slots[ids[n]]

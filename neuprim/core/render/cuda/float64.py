@@ -1,9 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""The pixel stage in float64, for the few primitives that need more than float32: chords, opacities, gradients.
+"""The pixel stage in float64, for the few primitives for which float32 is not accurate enough.
 
-The formulas are those of :mod:`neuprim.core.render.cpu.float64`; a hard edge is q = 1. Opacities and entries are stored
-in the slots (pixels of pairs) before compositing. For gradients of edges see
-:func:`neuprim.core.render.cpu.gradients.chord_gradient`.
+It computes chords, opacities and gradients. The formulas are those of :mod:`neuprim.core.render.cpu.float64`; a hard
+edge has the weight q = 1. Opacities and entries are stored in the slots (pixels of pairs) before compositing. For
+gradients of edges see :func:`neuprim.core.render.cpu.gradients.chord_gradient`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _TERMS = 14
 
 @wp.struct
 class Chord64:
-    """A :class:`~neuprim.core.render.cuda.chord.Chord` in float64; the ray's origin does not slide."""
+    """A :class:`~neuprim.core.render.cuda.chord.Chord` (part of a ray in a primitive) in float64; it has no slide."""
 
     du: wp.float64
     dv: wp.float64
@@ -51,7 +51,7 @@ def _wide_row_vector(wide: Doubles2d, r: int, c: int):
 
 @wp.func
 def intersect_chord64(wide: Doubles2d, r: int, X: int, Y: int):
-    """Return the chord of pixel (X, Y) in the primitive of row ``r`` of ``wide``."""
+    """Return the chord (part inside the primitive) of pixel (X, Y)'s ray; ``r`` is the primitive's row in ``wide``."""
     c = Chord64()
     zero, one = d(0.0), d(1.0)
     c.du = d(X) + d(0.5) - wide[r, W.UX]
@@ -76,7 +76,7 @@ def intersect_chord64(wide: Doubles2d, r: int, X: int, Y: int):
 
 @wp.struct
 class Weight:
-    """The edge weight q(u): its coefficients, its mean, and dq/d(1 - |y|^2) as a polynomial b0 + b1 u + b2 u^2."""
+    """The edge weight q(u) along a chord: coefficients, mean, and dq/d(1 - |y|^2) as polynomial b0 + b1 u + b2 u^2."""
 
     q: vec5d
     mean: wp.float64
@@ -87,7 +87,7 @@ class Weight:
 
 @wp.func
 def chord_edge_polynomial64(c: Chord64, edge: int):
-    """Return the edge weight q(u) = (D - a (shift + half u)^2)^p along a chord."""
+    """Return the edge weight q(u) = (D - a (shift + half u)^2)^p along a chord, u in [-1, 1], for p = ``edge``."""
     w = Weight()
     two, a, shift = d(2.0), d(1.0) / c.ia, c.mid - c.tm
     c0, c1, c2 = c.D - a * shift * shift, -two * a * shift * c.half, -a * c.half * c.half
@@ -114,7 +114,7 @@ def chord_edge_polynomial64(c: Chord64, edge: int):
 
 @wp.func
 def _chord_bessel(z: wp.float64):
-    """Return j_0 to j_5 of any z: by a series below 2, where upward recursion loses digits."""
+    """Return the spherical Bessel functions j_0 to j_5 at any z; by a series below 2, where recursion loses digits."""
     j = vec6d()
     if wp.abs(z) < d(2.0):
         square, power = d(0.5) * z * z, d(1.0)
@@ -138,7 +138,7 @@ def _chord_bessel(z: wp.float64):
 
 @wp.func
 def chord_moments(z: wp.float64):
-    """Return the moments C_0, S_1, C_2, S_3, C_4, S_5 of :mod:`neuprim.core.render.cpu.float64`."""
+    """Return the means of u^n cos(z u) (n = 0, 2, 4) and u^n sin(z u) (n = 1, 3, 5) over [-1, 1], in the order of n."""
     j = _chord_bessel(z)
     two, three, eight = d(2.0), d(3.0), d(8.0)
     M = vec6d()
@@ -187,7 +187,7 @@ def weighted_moments64(w: Weight, M: vec6d):
 
 @wp.struct
 class Pull64:
-    """The gradient dL/d(origin m, direction e, G) of a ray; G = du EX + dv EY grows with the pixel offset."""
+    """The gradient of a ray by its origin m, direction e and G = du EX + dv EY, which grows with the pixel offset."""
 
     m: wp.vec3d
     e: wp.vec3d
@@ -200,7 +200,10 @@ def chord_backward64(
     gD: wp.float64, gA: wp.float64,
     gq: wp.vec3d, gv: wp.vec3d,
 ):  # fmt: skip
-    """Like :func:`~neuprim.core.render.cuda.chord.chord_ends_backward` in float64, with a floor on D in dh/dD."""
+    """Return the gradient of a ray from the gradients of its chord, in float64; D has a floor in dh/dD.
+
+    For the arguments see :func:`~neuprim.core.render.cuda.chord.chord_ends_backward`.
+    """
     half, two = d(0.5), d(2.0)
     gt1, gt0 = half * (g_mid + g_half), half * (g_mid - g_half) * c.uncut
     tm, g_h = g_tm + gt0 + gt1, gt1 - gt0
@@ -224,14 +227,14 @@ def ray_norm(lens: wp.vec4, X: int, Y: int):
 
 @functools.cache
 def float64_opacity_kernel(depth: bool) -> Any:
-    """Return the kernel that computes opacities, for any form, and with ``depth`` camera-z of the chords' middles."""
+    """Return a kernel that computes opacities in float64, and with ``depth`` the camera-z of the chords' middles."""
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def float64_opacity(
         pairs: Ints, wide: Doubles2d, slots: Ints, ids: Ints, tiles: Ints, spans: Shorts2d, offsets: Ints,
         lens: wp.vec4, limits: wp.vec4, size: wp.vec2i, neurons: int, edge: int, hits: Vec2s, depths: Floats,
     ):  # fmt: skip
-        """Store the opacities of ``pairs``, one block each; ``slots[i]``: the row of primitive i in ``wide``."""
+        """Store the opacities of ``pairs``, one block of threads each; ``slots[i]``: row of primitive i in ``wide``."""
         member, lane = wp.tid()
         n, r = pairs[member], int(-1)
         if n >= 0:  # -1 fills the list
@@ -270,7 +273,7 @@ def float64_opacity_kernel(depth: bool) -> Any:
 
 @functools.cache
 def float64_pairs_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return the gradient kernel for float64 pairs of a form; with ``depth``, weight x depth has a gradient, too."""
+    """Return the kernel for gradient rows of float64 pairs; with ``depth``, the depth image has a gradient, too."""
     K, P, C = form.neurons, form.edge, form.channels
     width = L.gradient_width(K, C)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)

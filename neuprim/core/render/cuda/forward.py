@@ -1,9 +1,10 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Forward pass of compositing: one block per tile, one thread per pixel; two passes for ``sort = "entry"``.
 
-Primitives' rows are loaded into shared memory in batches. A tile is finished when T < T_min in all of its pixels. A hit
-stores (alpha, transmittance before it) in its slot (:func:`~neuprim.core.render.cuda.slots.row_spans`). The slots of
-float64 pairs already contain opacities (:mod:`~neuprim.core.render.cuda.float64`).
+Primitives' rows are loaded into shared memory in batches. A tile is finished when T < T_min in all of its pixels, T the
+transmittance. A hit (a primitive on a pixel's ray) stores (alpha, T before it) in its slot
+(:func:`~neuprim.core.render.cuda.slots.row_spans`). The slots of primitives drawn in float64 already contain opacities
+(:mod:`~neuprim.core.render.cuda.float64`).
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ from neuprim.core.settings import RenderSettings
 
 @wp.func
 def entry_sort_key(pixel: int, entry: float):
-    """Return an integer key that sorts by pixel, then by entry, whose float bits are mapped to ordered integers."""
+    """Return an int64 key that sorts by pixel, then by ``entry``, whose float bits are mapped to ordered integers."""
     bits = wp.int64(wp.cast(entry, wp.int32))
     if bits < wp.int64(0):
         bits = wp.int64(-1) - bits  # negative floats: larger ones have more bits
@@ -67,11 +68,11 @@ BATCH = 16  # rows in shared memory at a time
 
 @functools.cache
 def forward_kernel(form: KernelForm, keep: bool, depth: bool, listing: bool = False, several: bool = False) -> Any:
-    """Return the compositing kernel of a form.
+    """Return the compositing kernel for a form of primitives.
 
-    With ``keep``, it fills the slots, and reads float64 primitives from slots. With ``depth``, it also computes the sum
-    of weight x depth. With ``listing``, it only lists key and pair of every hit, for :func:`composite_kernel`. With
-    ``several``, there is more than one image.
+    With ``keep``, it fills the slots (saved data of hits), and reads float64 primitives from slots. With ``depth``, it
+    also computes the sum of weight x depth. With ``listing``, it only lists key and pair of every hit, for
+    :func:`composite_kernel`. With ``several``, there is more than one image.
     """
     assert (keep or not listing) and not (listing and several)
     K, P, C = form.neurons, form.edge, form.channels
@@ -90,7 +91,7 @@ def forward_kernel(form: KernelForm, keep: bool, depth: bool, listing: bool = Fa
         limits: wp.vec4, background: Floats, size: wp.vec2i, rgb: Floats2d, transmittance: Floats, zsum: Floats,
         hits: Vec2s, depths: Floats, hues: Floats2d, reached: Ints, keys: Longs, owners: Ints,
     ):  # fmt: skip
-        """Composite one tile per block; sets ``reached[tile]``, the end of the composited pairs.
+        """Composite one tile per block; set ``reached[tile]`` to the end of the pairs that were composited.
 
         ``limits`` holds alpha_min, alpha_max, transmittance_min and an unused number.
         """
@@ -259,7 +260,7 @@ def composite_kernel(form: KernelForm, depth: bool) -> Any:
         background: Floats, hues: Floats2d, depths: Floats, hits: Vec2s, rgb: Floats2d, transmittance: Floats,
         zsum: Floats, begins: Ints,
     ):  # fmt: skip
-        """Composite the hits of pixel tid; set ``begins[tid]`` to the first index of the hits in ``order``."""
+        """Composite pixel n's sorted hits, a thread per pixel; ``begins[n]`` is the first of its hits in ``order``."""
         n = wp.tid()
         first = _first_hit_of_pixel(keys, count, n)
         begins[n] = first
@@ -347,7 +348,7 @@ class KernelArrays:
 
     @property
     def covered(self) -> tuple[Any, ...]:
-        """Arrays with the primitive, the tile and the pixels of every pair."""
+        """Arrays with the primitive, the tile and the covered pixels of every (tile, primitive) pair."""
         return self.ids, self.tile_of, self.spans, self.offsets
 
 
@@ -361,9 +362,9 @@ def composite_frame(
     images: int = 1,
     capacity: FrameCapacity | None = None,
 ) -> CompositedFrame:
-    """Composite one image, or several (without gradients, sorted by centres).
+    """Composite a frame to one image, or to several (without gradients, sorted by centres).
 
-    Waits for the device if slots are needed and there is no ``capacity``.
+    Waits for the device if slots (memory for backward, float64 or sorting) are needed and there is no ``capacity``.
     """
     lists, device, camera = frame.lists, frame.device, frame.projection.camera
     pairs, tiles = lists.pairs, lists.starts.shape[0] - 1

@@ -1,4 +1,4 @@
-"""Column numbers of the CUDA kernels' arrays; :mod:`neuprim.core.render.layout` explains what columns hold.
+"""Column numbers of the CUDA kernels' arrays; :mod:`neuprim.core.render.layout` explains the columns' content.
 
 A primitive's row consists of float4 columns: one load of 16 bytes reads a vector and a scalar.
 """
@@ -22,8 +22,8 @@ from neuprim.core.render.layout import (  # noqa: F401 - kernels read them as L.
 )
 
 E0, EX, EY, XA, XU, XV, REST, NEURONS = 0, 1, 2, 3, 4, 5, 6, 7
-"""float4 columns, each with a vector and a scalar, see :data:`SCALARS`; REST holds four scalars, and the neurons come
-after it."""
+"""Numbers of the float4 columns of a primitive's row. Each column holds a vector and a scalar (:data:`SCALARS`), but
+REST holds four scalars. The neurons' columns come after REST."""
 
 SCALARS = {E0: "UX", EX: "UY", EY: "NEAR", XA: "OFFSET", XU: "TU", XV: "TV"}
 """The fourth number of each column. REST holds TC, UNIT, ANCHOR_Z and whether the primitive needs float64 (0 or 1); a
@@ -47,12 +47,12 @@ class KernelForm:
 
 
 def rasterizer_amplitude_column(neurons: int) -> int:
-    """Return the first column of the neurons' amplitudes, four per column."""
+    """Return the first column of a primitive's row with amplitudes of neurons; a float4 column holds four of them."""
     return NEURONS + neurons
 
 
 def rasterizer_colour_column(neurons: int) -> int:
-    """Return the first column of the colours, four channels per column."""
+    """Return the first column of a primitive's row with the colour; a float4 column holds four channels."""
     return rasterizer_amplitude_column(neurons) + -(-neurons // 4)
 
 
@@ -67,7 +67,7 @@ def wide_width(neurons: int) -> int:
 
 
 def rasterizer_net_columns(channels: int) -> int:
-    """Return the number of float4 columns per network unit: (WX, WY, WZ, PHASE), then four output weights each."""
+    """Return the number of float4 columns per unit of a colour network: (WX, WY, WZ, PHASE), then the weights."""
     return 1 + -(-channels // 4)
 
 

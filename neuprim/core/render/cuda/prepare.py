@@ -1,8 +1,8 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""The device arrays of a frame, and the per-primitive stage that fills them: one thread per primitive, in float64.
+"""Arrays of a frame on the device, and the kernel that projects primitives: one thread per primitive, in float64.
 
 This is the CUDA version of :mod:`neuprim.core.render.cpu.prepare`. Rows consist of float4 and include colours. Neurons
-stay in the order of the model. The stage also counts the tiles that each primitive reaches.
+stay in the order of the model. The kernel also counts the tiles that each primitive reaches.
 """
 
 import functools
@@ -82,7 +82,7 @@ def store_float4(rows: Vec4s2d, i: int, j: int, x: float, y: float, z: float, w:
 
 @wp.func
 def _store_vector(rows: Vec4s2d, i: int, j: int, v: wp.vec3d, scalar: wp.float64):
-    """Store a vector and a scalar, 16 bytes, in one instruction; a store of a Warp vector takes four."""
+    """Store a vector and a scalar as one float4, in one instruction; a store of a Warp vector takes four."""
     store_float4(rows, i, j, f(v[0]), f(v[1]), f(v[2]), f(scalar))
 
 
@@ -93,18 +93,18 @@ def _largest_ray_component(v: wp.vec3d):
 
 @wp.func
 def _projected_frequency(w: wp.vec3d, p: ProjectedPrimitive, turns: wp.float64):
-    """Return a neuron's frequencies on whitened axes, in turns."""
+    """Return a neuron's frequency vector on the ellipsoid's axes, in turns per semi-axis."""
     t = wp.transpose(p.local) * w
     return wp.vec3d(turns * p.axes[0] * t[0], turns * p.axes[1] * t[1], turns * p.axes[2] * t[2])
 
 
 @functools.cache
 def project_primitives_kernel(double: bool) -> Any:
-    """Return a kernel that fills rows, spans, boxes, depth, status and counts of every primitive; dim (N,).
+    """Return a kernel that fills rows, spans, boxes, depth, status and counts of every primitive; launch size (N,).
 
     Row 0 of ``counts`` (2, N) is the number of tiles reached, row 1 is 1 for visible primitives that need float64.
     ``bad`` (1,) is the first primitive that is not finite, colours included. Samples of less optical depth than
-    ``least`` are skipped.
+    ``least`` are skipped. ``forced`` primitives need float64.
     """
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
@@ -263,7 +263,7 @@ def _store_wide_vector(wide: Doubles2d, n: int, column: int, v: wp.vec3d):
 
 @functools.cache
 def wide_kernel(double: bool) -> Any:
-    """Return a kernel that fills ``wide``, the rows of primitives ``which`` that are drawn in float64; dim (M,)."""
+    """Return a kernel that fills ``wide``, the float64 rows of primitives ``which`` (M,); launch size (M,)."""
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
@@ -325,7 +325,7 @@ class Projection:
 
 @dataclass(frozen=True)
 class Frame:
-    """Device arrays of one view; :mod:`neuprim.core.render.cuda.layout` names the columns."""
+    """Arrays of one view on the device; :mod:`neuprim.core.render.cuda.layout` names their columns."""
 
     projection: Projection  # the view
     parameters: tuple[Tensor, ...]  # tensors of PARAMETERS, contiguous, all float32 or all float64
@@ -360,7 +360,7 @@ class Frame:
 
 
 def rasterizer_parameter_arrays(parameters: Sequence[Tensor]) -> tuple[Any, ...]:
-    """Return parameters, or their gradients, as Warp arrays of numbers and vectors."""
+    """Return the primitives' parameters, or their gradients, as Warp arrays of numbers, 3-vectors and 4-vectors."""
     double = parameters[0].dtype == torch.float64
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
     return tuple(array(x, kind) for x, kind in zip(parameters, (vec3, vec3, vec4, vec3, real, real, real), strict=True))

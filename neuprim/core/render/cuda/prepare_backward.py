@@ -1,5 +1,5 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Backward pass of the per-primitive stage, one thread per primitive, as in the cpu backend's ``prepare_backward``."""
+"""Backward pass of the projection of primitives, one thread each, as in the cpu backend's ``prepare_backward``."""
 
 import functools
 from typing import Any
@@ -36,7 +36,7 @@ def _load_gradient_vector(grads: Floats2d, i: int, column: int):
 
 @wp.func
 def quaternion_gradient(q: wp.vec4d, n: wp.float64, g: wp.mat33d):
-    """Return dL/dq from dL/dR; the normalisation projects out the radial part."""
+    """Return dL/dq from dL/dR, R the rotation of quaternion q; ``n`` is 1/|q|. No gradient is along q."""
     two = d(2.0)
     w, x, y, z = q[0] * n, q[1] * n, q[2] * n, q[3] * n
     gw = two * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
@@ -129,7 +129,8 @@ def _prepare_backward_kernel(double: bool) -> Any:
 def prepare_backward(frame: Frame, grads: Tensor, want_view: bool = False) -> tuple[tuple[Tensor, ...], Tensor | None]:
     """Return float32 gradients of the parameters, and with ``want_view`` the (3, 4) float64 gradient of (R | t).
 
-    ``grads`` are (N, gradient_width) float32 rows; a row with weight 0 gives zero gradients.
+    (R | t) is the camera's rotation and translation. ``grads`` are the (N, gradient_width) float32 gradient rows of the
+    pixel stage; a row with weight 0 gives zero gradients.
     """
     out = tuple(torch.empty(x.shape, dtype=torch.float32, device=x.device) for x in frame.parameters)
     g_view = torch.empty(grads.shape[0], 12, dtype=torch.float64, device=grads.device) if want_view else None

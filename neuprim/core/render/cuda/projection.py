@@ -18,7 +18,7 @@ _ANCHOR_RADII = wp.constant(d(ANCHOR_RADII))
 
 @wp.struct
 class View:
-    """Camera axes, centre and intrinsics (fx, fy, cx, cy), and the near plane."""
+    """A camera: world-to-camera rotation R and translation t, focal lengths, principal point (pixels), near plane."""
 
     R: wp.mat33d
     t: wp.vec3d
@@ -29,7 +29,7 @@ class View:
 
 @wp.struct
 class ProjectedPrimitive:
-    """Orientation in camera axes, rotation, axes s/m, centre, anchor (depth, pixel x, y), m and 1/|q|."""
+    """Orientation in camera (B) and scene axes, semi-axes over the longest (m), centre, anchor (depth, x, y), 1/|q|."""
 
     B: wp.mat33d
     local: wp.mat33d
@@ -42,9 +42,10 @@ class ProjectedPrimitive:
 
 @wp.struct
 class Ray:
-    """A = m S^-1 B^T and the rays of a primitive in whitened space.
+    """The rays of all pixels through a primitive, in whitened space, where the ellipsoid is the unit sphere.
 
-    Rays are x(t) = (xa + du xu + dv xv + s G) + t (e0 + G), with G = du ex + dv ey and s = du tu + dv tv.
+    For pixel offset (du, dv) from the anchor, the ray is x(t) = (xa + du xu + dv xv + s G) + t (e0 + G), with G = du ex
+    + dv ey and s = du tu + dv tv. A = m S^-1 B^T converts camera axes to whitened axes.
     """
 
     A: wp.mat33d
@@ -80,7 +81,10 @@ def load_projection_view(matrix: Doubles, intrinsics: wp.vec4d, near: wp.float64
 
 @wp.func
 def project_primitive(mean: wp.vec3d, log_scale: wp.vec3d, quat: wp.vec4d, v: View):
-    """Project a primitive. The anchor is rounded *before* its use, so that pixel kernels subtract the same value."""
+    """Compute a primitive's orientation, centre and anchor pixel in the view ``v``.
+
+    The anchor is rounded *before* its use, so that pixel kernels subtract the same value.
+    """
     one, two = d(1.0), d(2.0)
     p = ProjectedPrimitive()
     n = one / wp.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])

@@ -1,4 +1,4 @@
-"""Frames as CUDA graphs: a model that is rendered again by the same camera, from another place, is replayed.
+"""Record frames as CUDA graphs, and replay them when a model is rendered again by the same camera from another place.
 
 The arrays of a recorded frame have fixed sizes. A frame that does not fit, or has numbers that are not finite, is
 rendered again without the recording, which enlarges the arrays or names the error.
@@ -39,7 +39,7 @@ class _Program:
 
 
 class FrameRecorder:
-    """Records the frames of one model, whose parameters may change their values but not their memory.
+    """Records the frames of one model as CUDA graphs. Parameters may change their values but not their memory.
 
     Attributes:
         replayed: number of frames that were replayed.
@@ -94,7 +94,7 @@ class FrameRecorder:
             return replace(made, rgb=made.rgb.clone(), alpha=made.alpha.clone(), depth=depth)
 
     def observe(self, output: RenderOutput) -> None:
-        """Read the counts of a frame that was not recorded, and enlarge the arrays if a count exceeds the capacity."""
+        """Read the counts of a frame that was not recorded; enlarge the arrays if a count exceeds their capacity."""
         with self._turn:
             counts = frame_counts(output.stats)
             if self._capacity is not None and self._capacity.fits(counts):
@@ -130,7 +130,7 @@ _recorders: weakref.WeakKeyDictionary[Primitives, FrameRecorder] = weakref.WeakK
 
 
 def frame_recorder(model: Primitives) -> FrameRecorder:
-    """Return the recorder of a model."""
+    """Return the recorder of a model's frames; the first call creates it."""
     if model not in _recorders:
         _recorders[model] = FrameRecorder(model.device)
     return _recorders[model]

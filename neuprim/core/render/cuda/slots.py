@@ -1,7 +1,7 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Slots: the pixels that each pair of tile and primitive covers, in which the forward pass saves data for backward.
+"""Slots: memory for each pixel of each (tile, primitive) pair, in which the forward pass saves data for backward.
 
-Frames that exceed a :class:`~neuprim.core.render.cuda.binning.FrameCapacity` are emptied here.
+Frames that exceed the array sizes of a :class:`~neuprim.core.render.cuda.binning.FrameCapacity` are emptied here.
 """
 
 import torch
@@ -44,7 +44,7 @@ _STORE_SPANS = f"""
 
 @wp.func_native(_STORE_SPANS)
 def _store_spans(spans: Shorts2d, n: int, packed: _PackedSpans):
-    """Store the spans of a pair in two instructions instead of 16."""
+    """Store the 16 row spans of pair ``n``, packed into eight numbers, in two instructions instead of 16."""
 
 
 @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
@@ -52,10 +52,12 @@ def row_spans(
     rows: Vec4s2d, silhouettes: Floats2d, boxes: Vec4is, starts: Ints, ids: Ints, tiles: Ints, size: wp.vec2i,
     spans: Shorts2d, counts: Ints2d,
 ):  # fmt: skip
-    """Thread n writes the pixels that pair n covers in its tile: start << 8 | last << 4 | first for each of 16 rows.
+    """Write the pixels that each (tile, primitive) pair covers in its tile, as 16 row spans; thread n handles pair n.
 
-    Each covered pixel has a slot for the data of the backward pass, in the order of pairs, rows and pixels. The slots
-    take a fifth of the memory of whole tiles. ``counts`` (2, pairs): row 0 counts slots, row 1 float64 pairs.
+    A span is start << 8 | last << 4 | first: first and last covered pixel of the row, and the number of covered pixels
+    in earlier rows. Each covered pixel has a slot for the data of the backward pass, in the order of pairs, rows and
+    pixels. The slots take a fifth of the memory of whole tiles. ``counts`` (2, pairs): row 0 counts slots, row 1
+    float64 pairs.
     """
     n = wp.tid()
     if n >= starts[starts.shape[0] - 1]:  # the arrays are larger than the frame needs
@@ -98,7 +100,7 @@ def row_spans(
 
 @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
 def list_float64_pairs(starts: Ints, counts: Ints2d, ends: Longs2d, found: Ints):
-    """Write the pairs that need float64 to ``found``, in order, from ``counts`` of row_spans and sums ``ends``."""
+    """Write the pairs that need float64 to ``found``, in order; ``ends`` are the running sums of ``counts``."""
     n = wp.tid()
     if counts[1, n] > 0 and n < starts[starts.shape[0] - 1]:  # a refused frame has no pairs
         found[int(ends[1, n]) - 1] = n
@@ -110,7 +112,8 @@ def refuse_frame(
 ):  # fmt: skip
     """Empty all tiles and set ``refused`` if the frame exceeds its capacity or a primitive is not finite.
 
-    ``capacity`` holds the sizes of :class:`FrameCapacity`, ``slot_ends`` running sums of the counts of row_spans.
+    ``capacity`` holds the sizes of :class:`FrameCapacity`. ``ends`` and ``slot_ends`` are running sums of the counts of
+    primitives and of pairs.
     """
     t = wp.tid()
     last, pair = ends.shape[1] - 1, slot_ends.shape[1] - 1
@@ -126,9 +129,10 @@ def refuse_frame(
 
 
 def count_slots(frame: Frame, counts: Tensor, capacity: FrameCapacity | None) -> tuple[int, Tensor, Tensor]:
-    """Return the number of slots, the (pairs + 1,) first slots, and a list of the float64 pairs, padded with -1.
+    """Return the number of slots, the (pairs + 1,) first slot of each pair, and a list of the float64 pairs.
 
-    Waits for the device if there is no ``capacity``. Raises BackendUnavailable if there are too many slots.
+    -1 pads the list. Waits for the device if there is no ``capacity``. Raises BackendUnavailable if there are too many
+    slots.
     """
     device, pairs = frame.device, counts.shape[1]
     ends = running_sums(counts)
@@ -153,7 +157,7 @@ def count_slots(frame: Frame, counts: Tensor, capacity: FrameCapacity | None) ->
 
 
 def refuse_misfit(frame: Frame, slot_ends: Tensor, capacity: FrameCapacity) -> None:
-    """Empty the tiles of a frame that does not fit. ``slot_ends`` are running sums of slots and of float64 pairs."""
+    """Empty all tiles of a frame that exceeds ``capacity``; ``slot_ends``: running sums of slots and float64 pairs."""
     starts = frame.lists.starts
     sizes = wp.vec4i(*capacity.sizes)
     sums = (array(frame.ends, wp.int64), array(slot_ends, wp.int64), array(frame.bad, wp.int32))

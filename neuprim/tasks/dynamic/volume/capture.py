@@ -1,8 +1,8 @@
-"""Render a volume sequence: cameras around the unit box, images of every frame, and their files.
+"""Render a volume sequence (smoke, fire) from cameras around its unit box; write images and points of every frame.
 
 volumes/KEY/scene.json                 what was rendered, and how scene units map to the files' world
 volumes/KEY/frame_00012/cam_07.exr     linear RGB radiance and alpha, premultiplied, half floats
-volumes/KEY/frame_00012/points.npz     where the frame's matter is, for starting points
+volumes/KEY/frame_00012/points.npz     where the frame's matter is, for starting points; KEY is a hash of all inputs
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Capture:
 
     @property
     def components(self) -> tuple[str, ...]:
-        """The extinction grid's meaning if flames add to sigma, so that models store the grid's share; else empty."""
+        """Meanings of grids whose share of sigma models store: the extinction grid if flames add to it, else none."""
         return (self.reader.extinction,) if self.optics.mixes(self.reader.names) else ()
 
     @property
@@ -125,7 +125,7 @@ class Capture:
             raise DataError(f"{frame.path}: {error}") from error
 
     def placement(self) -> DensityGridPlacement:
-        """Return how the scene maps to the world of its .vdb files, with frame numbers, times and grid names."""
+        """Return the scene's position in the world of its .vdb files, with frame numbers, times and grid names."""
         optics, names = self.optics, self.reader.names
         flames_absorb = optics.flame_extinction > 0 and optics.flame_grid in names
         return DensityGridPlacement(
@@ -199,7 +199,10 @@ class Capture:
 
 
 def _sample_medium_points(medium: Medium, seed: int) -> dict[str, Any]:
-    """Draw starting points in a medium, in proportion to the extinction, jittered inside their voxels."""
+    """Draw starting points in a medium, in proportion to the extinction, jittered inside their voxels.
+
+    Return "means" (M, 3), scene units, "colors" (M, 3), radiance, and "weight", the integral of the extinction.
+    """
     generator = np.random.default_rng(seed)
     sigma = medium.values[..., 0]
     total = float(sigma.sum(dtype=np.float64))
@@ -318,7 +321,8 @@ def _describe_capture_write_errors(store: Store) -> Iterator[None]:
 # ---------------------------------------------------------------- cameras
 
 _TEST_CAMERAS = (0.4, 0.75)
-"""Positions of the test cameras from rim to pole: neighbours on all sides, 90 degrees apart."""
+"""Positions of the two test cameras in the sequence of all cameras, which runs from the rim of the hemisphere (0) to
+its pole (1). Both have neighbours on all sides, and they are 90 degrees apart."""
 
 _DISTANCE = 2.7  # of cameras from the origin, the centre of the box, scene units (box sides)
 _ELEVATIONS = (3.0, 80.0)  # degrees above the horizon of the lowest and the highest camera

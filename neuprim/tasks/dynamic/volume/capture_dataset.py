@@ -32,7 +32,7 @@ TRAINING_MEMORY, _TEST_MEMORY, _VOXEL_MEMORY = 6 / 11, 1 / 11, 4 / 11
 """Shares of the memory for training images, test images (read in order) and voxels."""
 
 LIGHT_DISTANCE = 1e4
-"""Distance of directional lights from the scene's centre, scene units."""
+"""Distance from the scene's centre at which directional lights are placed, scene units."""
 
 _MIN_ALPHA = 1.0 / 255.0  # least alpha of a pixel that shows matter
 
@@ -40,7 +40,10 @@ T = TypeVar("T")
 
 
 class _RecentFrames(Generic[T]):
-    """Cache of items, read by index on first use. Beyond ``memory`` bytes, the least recently used are dropped."""
+    """Cache of items, which ``read`` (index) provides on first use; ``size`` returns an item's bytes.
+
+    If the items exceed ``memory`` bytes, the least recently used ones are dropped.
+    """
 
     def __init__(self, read: Callable[[int], T], size: Callable[[T], int], memory: float) -> None:
         self._read, self._size, self._memory = read, size, memory
@@ -65,6 +68,7 @@ class VdbFrameViews(ViewSet):
 
     Args:
         folder: store of the images.
+        cameras: numbers of the capture's cameras whose views are included.
         exposure: radiance that is scaled to 1.
         every: use every n-th frame only; times remain relative to the whole sequence.
         memory: limit on the decoded images in memory, bytes.
@@ -184,7 +188,7 @@ class VolumeRecording:
         return PointCloud(torch.cat(means), torch.cat(colors), {"time": torch.cat(times)}, steps=steps)
 
     def matter_mask(self, index: int) -> Tensor:
-        """Return (H, W) bool: pixels that matter covers in any frame of a test view's camera; cached."""
+        """Return (H, W) bool: pixels that smoke or fire covers in any frame of the camera of test view ``index``."""
         frames = len(self.capture.frames)
         camera = index // frames
         if camera not in self._masks:
@@ -310,7 +314,8 @@ class MediumVoxels:
 
     Attributes:
         index: (V,) int64 ascending, flat indices (i Y + j) Z + k of a grid of ``shape``.
-        values: (V, C) float32: sigma, sigma times RGB radiance and, if flames add to sigma, the extinction grid's part.
+        values: (V, C) float32, C = 4 or 5: sigma, sigma times RGB radiance and, if flames add to sigma, the part of
+            sigma that comes from the extinction grid.
         scene_from_index: (4, 4) float64.
     """
 
@@ -333,7 +338,10 @@ class MediumVoxels:
 
     @functools.cached_property
     def rms(self) -> tuple[float, float, float]:
-        """Root mean squares over voxels: of sigma, sigma times radiance, the extinction grid's part; 0 if empty."""
+        """Root mean squares over the voxels of three values; 0 without voxels.
+
+        The values are sigma, sigma times radiance, and the extinction grid's part of sigma (0 if it is not stored).
+        """
         if not len(self.index):
             return 0.0, 0.0, 0.0
         squares = np.square(self.values, dtype=np.float64).mean(0)
@@ -438,7 +446,11 @@ class FrameVoxels(PointSupervision):
         return self.folder.retry(lambda: self._read_or_make_voxels(self.frames[t]), warn_once)
 
     def _supervised_medium(self, frame: VdbFrame) -> Medium:
-        """Return a frame's medium. It includes the light, unless there are several: then the model adds their light."""
+        """Return the medium whose voxels a model is compared with in training.
+
+        Its radiance includes the scattered light of a single light. If the capture has several lights, their light is
+        not included, since the model adds it.
+        """
         capture, medium = self.capture, self.capture.medium(frame)
         return medium if capture.lights > 1 else light_medium(medium, capture.frame_lights(frame)[0], capture.optics)
 

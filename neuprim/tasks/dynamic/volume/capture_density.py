@@ -1,4 +1,4 @@
-"""Ground-truth extinction and look of a volume sequence's files, and the errors of models against them."""
+"""Ground-truth extinction and radiance of a volume sequence's .vdb files, and the errors of models against them."""
 
 from __future__ import annotations
 
@@ -33,9 +33,10 @@ _COMPARED_PER_THIRD = 3  # frames
 def sample_extinction(
     medium: Medium, scene_from_index: Tensor, shape: tuple[int, int, int], part: bool = False
 ) -> np.ndarray:
-    """Sample a medium's extinction at the points of a grid, trilinearly: (X, Y, Z) float32.
+    """Sample a medium's extinction trilinearly at the points of a grid of ``shape`` (X, Y, Z); return float32.
 
-    With ``part``, the result is only the contribution of the extinction grid, without flames.
+    ``scene_from_index`` (4, 4) maps the grid's indices to scene coordinates. With ``part``, the result is only the
+    contribution of the extinction grid, without flames.
     """
     if medium.values.size == 0:
         return np.zeros(shape, np.float32)
@@ -118,12 +119,13 @@ class CaptureDensity(DensityGridSource):
 
 
 def compare_capture_extinction(model: Primitives, capture: Capture, times: list[float]) -> dict[str, Any]:
-    """Measure a model's errors of sigma on all voxels of the sequence's box, for the early, middle and late third.
+    """Measure a model's errors of extinction (sigma) against the .vdb files of a sequence; return name -> value.
 
-    "sigma_frames" has the errors of each compared frame, see
-    :func:`~neuprim.core.volumes.density_truth.measure_density_errors`. The errors of a third are means over three
-    evenly spaced frames. Frames without extinction are left out. If flames add to the extinction of a grid, the errors
-    of that grid's part are also measured: "density_frames", ...
+    All voxels of the sequence's box are compared. ``times`` has the time of every frame. "sigma_frames" has the errors
+    of each compared frame, see :func:`~neuprim.core.volumes.density_truth.measure_density_errors`. There are also means
+    over the early, middle and late third of the sequence, each over three evenly spaced frames. Frames without
+    extinction are left out. If flames add to the extinction of a grid, the errors of that grid's part are also
+    measured: "density_frames", ...
     """
     result: dict[str, Any] = {}
     count, truth, compared = len(capture.frames), CaptureDensity(capture), 3 * _COMPARED_PER_THIRD

@@ -1,4 +1,4 @@
-"""From the grids of a frame to its medium, and the light that the medium scatters."""
+"""Build a frame's medium (extinction and radiance per voxel) from OpenVDB grids; add the light that it scatters."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _BLACK_BODY_STEPS = 1024  # entries of the table of black bodies; linear between
 
 
 def build_medium(grids: Mapping[str, VdbGrid], optics: Optics, scene_from_world: np.ndarray) -> Medium:
-    """Build the medium of one frame on the voxels of its extinction grid, without the optics' light.
+    """Build the medium of one frame on the voxels of its extinction grid, without the light ``optics.light``.
 
     Other grids are sampled at the centres of these voxels, trilinearly unless they have the same transform. If flames
     absorb, the voxels are extended to contain all flames. An empty frame gives an empty medium.
@@ -67,7 +67,10 @@ def build_medium(grids: Mapping[str, VdbGrid], optics: Optics, scene_from_world:
 
 
 def _transform_medium_bounds(grid: VdbGrid, transform: np.ndarray) -> Bounds | None:
-    """Return the bounds of the voxels of ``transform`` whose centres lie in a grid's active box."""
+    """Return the bounds of the active box of ``grid`` in voxels of another grid, or None if it has no active voxels.
+
+    ``transform`` is the index-to-world matrix of the other grid. Its voxels with centres in the box are inside.
+    """
     if grid.bounds is None or _same_voxels(grid.transform, transform):
         return grid.bounds
     ends = np.array(grid.bounds, np.float64) - 0.5  # faces of the outermost voxels, not centres
@@ -97,9 +100,10 @@ def _same_voxels(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def _sample_medium_grid(grid: VdbGrid, transform: np.ndarray, box: Bounds, channels: int = 1) -> np.ndarray:
-    """Sample a grid at the voxel centres of ``box`` under ``transform``.
+    """Sample a grid at the centres of the voxels in ``box`` (index bounds), trilinearly unless they are its own voxels.
 
-    Values that are not finite and negative scalars become 0.
+    ``transform`` maps indices to the world. The result is (X, Y, Z) float32, or (X, Y, Z, 3) for three channels. Values
+    that are not finite and negative scalars become 0.
     """
     if grid.channels != channels:
         raise DataError(f"grid {grid.name!r} has {grid.channels} channels; expected {channels}")
@@ -124,7 +128,11 @@ def _sample_medium_grid(grid: VdbGrid, transform: np.ndarray, box: Bounds, chann
 def _scattering_albedo(
     grids: Mapping[str, VdbGrid], optics: Optics, transform: np.ndarray, box: Bounds, scene_from_index: np.ndarray
 ) -> np.ndarray:
-    """Return the albedo times colour grid or gradient, broadcastable to (X, Y, Z, 3)."""
+    """Return the albedo, times the colour grid or else the colour gradient; broadcastable to (X, Y, Z, 3).
+
+    ``transform`` maps the voxel indices in ``box`` to the world; ``scene_from_index`` is relative to the start of
+    ``box``.
+    """
     albedo = np.array(optics.albedo, np.float32)
     if optics.color_grid is not None and optics.color_grid in grids:
         return albedo * np.clip(_sample_medium_grid(grids[optics.color_grid], transform, box, 3), 0.0, 1.0)
@@ -140,7 +148,7 @@ def _scattering_albedo(
 
 
 def _flame_radiance(flame: np.ndarray, optics: Optics) -> np.ndarray:
-    """Return the radiance of flames, emission · B(K(flame)) of :class:`Optics`, (X, Y, Z, 3) float32."""
+    """Return the (X, Y, Z, 3) float32 black-body radiance of flames: emission · B(K(flame)), see :class:`Optics`."""
     low, high = optics.flame_range
     table = black_body_rgb(np.linspace(*optics.kelvin, _BLACK_BODY_STEPS), optics.kelvin[1]) * optics.emission
     where = np.clip((flame - low) / (high - low), 0.0, 1.0) * (_BLACK_BODY_STEPS - 1)
@@ -156,7 +164,10 @@ _LOWEST = math.radians(10.0)  # lowest elevation of random lights
 
 
 def draw_lights(optics: Optics, count: int, *key: int) -> list[Light | None]:
-    """Draw ``count`` random lights, as strong as the optics' light, uniform over the sky; ``key`` is the seed."""
+    """Draw ``count`` random directional lights with the irradiance of ``optics.light``; ``key`` is the seed.
+
+    Directions are uniform over the sky above an elevation of 10 degrees. Without ``optics.light``, all lights are None.
+    """
     own = optics.light
     if own is None:
         return [None] * count
@@ -170,7 +181,7 @@ def draw_lights(optics: Optics, count: int, *key: int) -> list[Light | None]:
 
 
 def light_medium(medium: Medium, light: Light | None, optics: Optics) -> Medium:
-    """Add isotropic scattering of a light, with shadows, to a medium's source; return the new medium."""
+    """Return the medium with scattered light of ``light``, isotropic and with shadows, added to its radiance."""
     if light is None or medium.empty or medium.scattered is None:
         return medium
     values = medium.values.copy()
@@ -183,7 +194,7 @@ def light_medium(medium: Medium, light: Light | None, optics: Optics) -> Medium:
 
 
 def light_by_fire(medium: Medium, glow: np.ndarray, optics: Optics) -> Medium:
-    """Add the light of flames, scattered by the smoke, to a medium's source; return the new medium.
+    """Return the medium with the light of its flames, scattered by its smoke, added to its radiance.
 
     The glowing voxels are divided into at most ``optics.fire_lights`` clusters, each of which lights the smoke as one
     point light at its centre: σ_s albedo S(T) I/(4π (r² + ρ²)). I is the sum of σ c over the cluster times the volume
@@ -220,10 +231,10 @@ def light_by_fire(medium: Medium, glow: np.ndarray, optics: Optics) -> Medium:
 
 
 def split_lights(points: np.ndarray, weights: np.ndarray, most: int) -> list[np.ndarray]:
-    """Divide ``points`` (M, 3) with positive ``weights`` (M,) into at most ``most`` clusters; return their rows.
+    """Divide ``points`` (M, 3) with positive ``weights`` (M,) into at most ``most`` clusters.
 
-    The cluster with the largest weighted variance is split at its mean along the axis of largest variance, again and
-    again.
+    Return the indices of the points of each cluster. In each step, the cluster with the largest weighted variance is
+    split at its mean, along its axis of largest variance.
     """
     clusters = [np.arange(len(points))]
     while len(clusters) < most:

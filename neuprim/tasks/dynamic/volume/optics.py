@@ -21,7 +21,7 @@ UP_AXES = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 GridMeaning = Literal["density", "temperature", "flames", "color"]
 
 GRIDS: tuple[str, ...] = get_args(GridMeaning)
-"""What a grid may mean; ``scene.grids.MEANING=NAME`` names the grid of the files that has it."""
+"""Possible meanings of a grid; the setting ``scene.grids.MEANING=NAME`` names the grid of the files with a meaning."""
 
 NotNegative = Annotated[float, Range(at_least=0)]
 RGB = Annotated[
@@ -49,7 +49,7 @@ ExtinctionGrids = Annotated[
 ]
 
 DATA_DEPENDENT = ("extinction", "flame_extinction", "flame_range")
-"""Settings that are derived from the values of given files, unless the user sets them."""
+"""Settings of :class:`Optics` that are derived from the values in given .vdb files, unless the user sets them."""
 
 
 @dataclass(frozen=True)
@@ -126,10 +126,10 @@ class Optics:
 
     @property
     def octave_share(self) -> float:
-        """Light of an octave of scattering as a fraction of the octave before: half the mean albedo.
+        """Strength of each further octave of scattered light, relative to the one before: half the mean albedo.
 
-        In two to four octaves, this comes close to path tracing for albedos of 0.45 to 0.99 and thin to dense smoke
-        (benchmarks/multiple_scattering.py).
+        An octave approximates one more order of multiple scattering. With two to four octaves, images come close to
+        path tracing for albedos of 0.45 to 0.99 and thin to dense smoke (benchmarks/multiple_scattering.py).
         """
         return min(sum(self.albedo) / 6, 1.0)
 
@@ -138,7 +138,7 @@ class Optics:
         return self.extinction > 0 and self.flame_extinction > 0 and self.flame_grid in names
 
     def turn_to_axis(self, up: Axis) -> Optics:
-        """Return these optics for sequences with the up axis ``up``: the light's direction is rotated accordingly."""
+        """Return these optics for sequences whose upward axis is ``up``, with the light's direction rotated to it."""
         if up == self.up or self.light is None:
             return replace(self, up=up)
         x, y, z = self.light.direction
@@ -155,7 +155,8 @@ EMBERGEN_FIRE = Optics(
     kelvin=(1050.0, 2155.0),
     emission=2.0,
 )
-"""EmberGen's free fire, which has no density: hot gas absorbs, flames glow, an ambient grey of 0.05 shows the rest."""
+"""Optics of EmberGen's free fire, which has no density grid: the temperature grid absorbs, flames glow. A grey ambient
+radiance of 0.05 makes the gas without flames visible."""
 
 SMOKE_FIRE = Optics(
     extinction=14.0,
@@ -166,7 +167,7 @@ SMOKE_FIRE = Optics(
     emission=1.5,
     flame_extinction=14.0,
 )
-"""Dark smoke under a soft light, and flames that outshine it."""
+"""Optics of dark smoke under a soft light, and of brighter flames."""
 
 COLORFUL_SMOKE = Optics(
     extinction=45.0,
@@ -176,7 +177,7 @@ COLORFUL_SMOKE = Optics(
     color_grid="color",
     gradient=((0.95, 0.25, 0.15), (0.95, 0.75, 0.15), (0.20, 0.75, 0.45), (0.20, 0.40, 0.95), (0.70, 0.25, 0.85)),
 )
-"""Dense smoke in many colours that shadows itself."""
+"""Optics of dense smoke in many colours that shadows itself."""
 
 GROUND_EXPLOSION = Optics(
     extinction=60.0,
@@ -187,7 +188,7 @@ GROUND_EXPLOSION = Optics(
     emission=6.0,
     flame_extinction=30.0,
 )
-"""A hot core inside thick brown-grey smoke."""
+"""Optics of a hot core inside thick brown-grey smoke."""
 
 DUST_TORNADO = Optics(
     extinction=26.0,
@@ -195,7 +196,7 @@ DUST_TORNADO = Optics(
     ambient=(0.14, 0.17, 0.22),
     light=Light((0.75, 0.3, 0.6), (8.5, 7.8, 6.6)),
 )
-"""Sand in the sun under a blue sky."""
+"""Optics of sand in the sun under a blue sky."""
 
 OPTICS_PRESETS = {
     "embergen_fire": EMBERGEN_FIRE,

@@ -141,7 +141,8 @@ def render_medium(medium: Medium, camera: Camera, samples: int = 2, subdivisions
 def light_transmittance(medium: Medium, direction: Sequence[float]) -> np.ndarray:
     """Return (X, Y, Z) float32 transmittance exp(-∫ σ ds) from voxel centres to a directional light.
 
-    ``direction`` points to the light, on the scene's axes, any length > 0; otherwise as :func:`point_transmittance`.
+    ``direction`` points to the light, on the scene's axes, any length > 0. The transmittance is exact up to rounding.
+    Voxels without extinction get 1; no ray is traced from them.
     """
     towards = np.array(direction, np.float64)
     return _transmittance_to(medium, np.append(towards / float(np.linalg.norm(towards)), 0.0))
@@ -156,7 +157,10 @@ def point_transmittance(medium: Medium, position: Sequence[float]) -> np.ndarray
 
 
 def _transmittance_to(medium: Medium, place: np.ndarray) -> np.ndarray:
-    """Return the transmittance to a homogeneous point (4,), scene axes; the last number is 0 for a direction."""
+    """Return (X, Y, Z) transmittance from voxel centres to ``place`` (4,), a homogeneous point in scene coordinates.
+
+    The last number of ``place`` is 1 for a position and 0 for a direction.
+    """
     result = np.zeros(medium.values.shape[:3], np.float32)
     if not medium.empty:
         sigma, units = (
@@ -173,7 +177,10 @@ def _transmittance_to(medium: Medium, place: np.ndarray) -> np.ndarray:
 
 @inline
 def _clip_march_to_slab(o, d, size, near, far):  # type: ignore[no-untyped-def]
-    """Clip the interval [near, far] of t to the part where ``o + t d`` is within 0..size, for one axis."""
+    """Return the part of the interval [near, far] of t in which a ray's coordinate ``o + t d`` is within 0..size.
+
+    The function treats one axis. The result is empty (near > far) if the ray misses this range.
+    """
     if abs(d) < 1e-12:
         return (near, far) if 0.0 <= o <= size else (_FAR, -_FAR)
     a, b = -o / d, (size - o) / d
@@ -182,7 +189,7 @@ def _clip_march_to_slab(o, d, size, near, far):  # type: ignore[no-untyped-def]
 
 @inline
 def _first_march_cell(o, d, t, cells):  # type: ignore[no-untyped-def]
-    """Return the cell index along one axis of the point ``o + t d``."""
+    """Return the index, along one axis, of the cell that contains ``o + t d``; clamped to 0..``cells`` - 1."""
     return min(max(math.floor(o + t * d), 0), cells - 1)
 
 
@@ -194,7 +201,10 @@ def _inverse_march_direction(d):  # type: ignore[no-untyped-def]
 
 @inline
 def _march_cell_exit(o, inverse, cell, reach):  # type: ignore[no-untyped-def]
-    """Return the t at which a ray o + t/``inverse`` leaves the cells ``cell - reach … cell + reach`` of one axis."""
+    """Return the t at which a ray leaves the cells ``cell - reach … cell + reach`` of one axis; 1e30 for never.
+
+    The ray's coordinate on this axis is ``o`` + t/``inverse``; ``inverse`` is 0 if it does not change.
+    """
     if inverse > 0.0:
         return (cell + reach + 1 - o) * inverse
     if inverse < 0.0:
@@ -204,7 +214,10 @@ def _march_cell_exit(o, inverse, cell, reach):  # type: ignore[no-untyped-def]
 
 @inline
 def _next_march_cell(o, d, cell, reach, t, crossed):  # type: ignore[no-untyped-def]
-    """Return the next cell index after ``t`` for one axis; exact on the crossed axis, so rounding stalls no ray."""
+    """Return the cell index along one axis after a ray has left the cells ``cell - reach … cell + reach`` at ``t``.
+
+    If the ray ``crossed`` their border on this axis, the index is exact, so that rounding cannot stop the ray.
+    """
     if crossed:
         return cell + reach + 1 if d > 0.0 else cell - reach - 1
     if reach == 0:
@@ -214,7 +227,10 @@ def _next_march_cell(o, d, cell, reach, t, crossed):  # type: ignore[no-untyped-
 
 @inline
 def _march_absorption(depth):  # type: ignore[no-untyped-def]
-    """Return (1 - exp(-depth)) / depth and exp(-depth), float32. A series for small depths avoids cancellation."""
+    """Return a step's mean transmittance (1 - exp(-depth)) / depth, and its total transmittance exp(-depth); float32.
+
+    ``depth`` is the optical depth of the step. A series for small depths avoids cancellation.
+    """
     if depth < _HALF:
         mean = _ONE - depth * _C7
         mean = _ONE - depth * _C6 * mean
@@ -229,7 +245,7 @@ def _march_absorption(depth):  # type: ignore[no-untyped-def]
 
 @inline
 def _short_march_transmittance(depth):  # type: ignore[no-untyped-def]
-    """Return exp(-depth) for depths of -0.05 to 0.55, to 3e-6; float32."""
+    """Return exp(-depth) by a polynomial, with an error of at most 3e-6 for depths of -0.05 to 0.55; float32."""
     rest = _ONE - depth * _C6
     rest = _ONE - depth * _C5 * rest
     rest = _ONE - depth * _C4 * rest
@@ -243,7 +259,7 @@ def _march_step_gains(a, b):  # type: ignore[no-untyped-def]
     """Return the weights of the sources at the two Gauss points of a step, and the step's transmittance, float32.
 
     Args:
-        a, b: optical depth of the first and the second half of the step, each from the extinction at one point.
+        a, b: optical depth of the first and the second half of the step, each from the extinction at its Gauss point.
     """
     depth = a + b
     if depth > _HALF:  # shortest steps in an almost opaque medium: the points one after the other, always in range
@@ -262,9 +278,9 @@ _FREE = ("nsz", "contract", "reassoc")  # fast-math flags of LLVM in _two_points
 
 
 def _generate_two_march_points(context: Any, flat: Any, corner: Any, first: Any, second: Any) -> Any:
-    """Generate code for trilinear values of four channels at two points of a cell, as vectors.
+    """Generate LLVM vector code that interpolates the four channels of voxels trilinearly at two points of a cell.
 
-    The scalar code takes 1.4 times as long, since LLVM does not vectorise it.
+    Return the numba signature and the generator. Scalar code takes 1.4 times as long, since LLVM does not vectorise it.
 
     Args:
         flat: float32 array of the interleaved voxels.
@@ -408,7 +424,7 @@ def _march_image_rows(start, stop, values, skips, pose, lens, width, samples, pa
 
 @inline
 def _trilinear_march_sample(v, i, j, k, x, y, z):  # type: ignore[no-untyped-def]
-    """Return the trilinear value of an (X, Y, Z) array at fractions of cell (i, j, k)."""
+    """Return the trilinear value of the array ``v`` (X, Y, Z) in cell (i, j, k), at the fractions x, y, z of it."""
     a = v[i, j, k] + z * (v[i, j, k + 1] - v[i, j, k])
     b = v[i, j + 1, k] + z * (v[i, j + 1, k + 1] - v[i, j + 1, k])
     c = v[i + 1, j, k] + z * (v[i + 1, j, k + 1] - v[i + 1, j, k])

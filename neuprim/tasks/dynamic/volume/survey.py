@@ -165,7 +165,7 @@ def _peak_vdb_value(counts: np.ndarray) -> float:
 
 
 def data_dependent_optics(optics: Optics, extinction: str, survey: SequenceSurvey) -> dict[str, Any]:
-    """Return settings of the optics that depend on the values in the files.
+    """Return the settings of ``optics`` that depend on the values in the files, adapted to these values.
 
     Presets assume grids with a peak of about 1, so the extinctions are divided by the peak. The divisor is rounded to a
     power of two, so that it rarely changes when frames are added or left out.
@@ -181,7 +181,7 @@ def data_dependent_optics(optics: Optics, extinction: str, survey: SequenceSurve
 
 @dataclass(frozen=True)
 class CaptureNormalisation:
-    """Map from world to scene: scene = (world - center) · scale, equal for all frames, without rotation."""
+    """Map from .vdb world to scene: scene = (world - center) · scale, equal for all frames, without rotation."""
 
     center: tuple[float, float, float]
     scale: float

@@ -280,7 +280,7 @@ def _prepare_vdb_scene(
 
 
 def _report_chosen_extinctions(scene: _PreparedVdbScene) -> None:
-    """Print one line with the extinctions that were adapted to the files and differ from the preset."""
+    """Print one line with the extinctions that differ from the preset, because they were adapted to the files."""
     capture = scene.capture
     preset = scene.settings.resolve_optics("density" in capture.reader.names)
     lines = []
@@ -299,15 +299,17 @@ MAX_FRAMES, MIN_FRAMES = 100, 25
 """Maximum and minimum frames per chunk for "auto". Short chunks cut off primitives that are active for a long time."""
 
 _TIME_POWERS = {"window_center": 1, "velocity": -1, "acceleration": -2, "W_t": -1}
-"""Parameters that depend on the unit of time -> their power of time."""
+"""Parameters whose unit contains time -> the exponent of time in it, e.g. -1 for a velocity."""
 
 _FRAMES_PER_OVERLAP, _MAX_OVERLAP = 8, 3
 """A chunk contains extra frames beyond each end: one per eight of its frames, from one to three. Without overlap, the
-change of models is visible where little moves. But both chunks must be trained on the frames of an overlap."""
+change from one chunk's model to the next is visible where little moves. But an overlap's frames are trained twice."""
 
 
 def split_into_time_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | None:
-    """Return the time chunks of a run; None if it is not split. Renders all frames, as chunks share one exposure.
+    """Return the time chunks (parts that are trained separately) of a run; None if the run is not split.
+
+    All frames are rendered first, since the chunks share one exposure.
 
     Raises:
         ConfigError: there are too few frames for so many chunks. Other errors as in :func:`load_volume_scene`.
@@ -370,7 +372,10 @@ def count_time_chunks(requested: int | str | None, frames: int, image_bytes: int
 
 
 def _rescale_time(capture: Capture, frames: Sequence[VdbFrame], config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings to change for a chunk: learning rates relative to its length, and windows that fit into it."""
+    """Return setting -> value to change for a chunk, the part ``frames`` of a sequence that is trained separately.
+
+    Learning rates of time-dependent parameters are adapted to the chunk's length; the initial window is limited to it.
+    """
     length = capture.time(frames[-1]) - capture.time(frames[0])
     density = TimeDensity(config["model"]["neurons"], **config["model"]["density"])
     rates = {spec.name: config["train"]["rates"].get(spec.name, spec.lr) for spec in density.parameters()}

@@ -1,4 +1,4 @@
-"""The scene ``mesh``: a user's mesh file, rendered by ray casting with the cameras and light of ``scene=solids``."""
+"""The scene ``mesh``: a user's mesh file, ray-cast with the cameras and dimmed light of the scene ``solids``."""
 
 from __future__ import annotations
 
@@ -53,7 +53,10 @@ class MeshSettings(SolidsSettings):
 
 
 def load_mesh(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load ``scene=mesh``, rendered on first use; DataError if the mesh is damaged or needs files of other folders."""
+    """Load ``scene=mesh``, whose images are rendered on first use and stored in the cache.
+
+    Raises DataError if the mesh is damaged or needs files of other folders.
+    """
     asked = validate_settings(MeshSettings, settings, "scene")
     folder = generate_mesh_images(asked, context.cache_dir, context.progress)
     from neuprim.tasks.static.datasets import load_blender
@@ -68,7 +71,7 @@ def load_mesh(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
 def generate_mesh_images(
     settings: MeshSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None
 ) -> Path:
-    """Write the images of ``scene=mesh`` unless they exist; return the folder ``cache_dir/mesh-KEY``."""
+    """Render the images of ``scene=mesh`` unless they exist; return their folder, ``cache_dir/mesh-HASH``."""
     path = find_model_file(settings.path)
     progress(f"mesh: reading {path.name}", 0.0)
     model = MODEL_READERS[path.suffix.lower()](MeshFolder(path, settings.skip_missing))

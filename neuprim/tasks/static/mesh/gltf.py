@@ -41,7 +41,10 @@ _ROWS = 50_000  # vertices that are skinned at once, which bounds the memory
 
 
 class _GltfPrimitive(NamedTuple):
-    """Indexed triangles of a glTF primitive in mesh coordinates: faces (F, 3), and values per vertex."""
+    """Triangles of a glTF primitive, a part of a mesh with one material: ``faces`` (F, 3), other arrays per vertex.
+
+    Positions and normals are in mesh coordinates; those of skinned meshes are in scene coordinates.
+    """
 
     material: str
     faces: NDArray[np.int64]
@@ -53,7 +56,7 @@ class _GltfPrimitive(NamedTuple):
 
 
 def read_gltf(folder: MeshFolder) -> Model:
-    """Read a .gltf or .glb file; DataError if it is damaged or compressed, or a reference is invalid."""
+    """Read the .gltf or .glb file of ``folder``; DataError if it is damaged, compressed or has an invalid reference."""
 
     def read() -> Model:
         reader = _GltfReader(GltfDocument(folder))
@@ -106,7 +109,7 @@ class _GltfReader:
         return found, self.vertices
 
     def _count_primitive(self, primitive: _GltfPrimitive) -> None:
-        """Count vertices and triangles of one use of a glTF primitive; raise DataError above a limit."""
+        """Add one use of a glTF primitive to the totals of vertices, triangles and parts; DataError above a limit."""
         self.vertices += len(primitive.positions)
         self.triangles += len(primitive.faces)
         self.parts += 1
@@ -116,7 +119,10 @@ class _GltfReader:
     def _read_gltf_mesh(
         self, number: int, node: Mapping[str, Any], materials: Mapping[str, Material], pose: NDArray | None = None
     ) -> list[_GltfPrimitive]:
-        """Read the triangles of the mesh of ``node``; ``pose`` has the (J, 4, 4) joint matrices of a skinned mesh."""
+        """Return the triangles of mesh ``number``, which ``node`` uses.
+
+        ``pose`` has the (J, 4, 4) joint matrices of a skinned mesh; None for other meshes.
+        """
         mesh = self.document.content["meshes"][number]
         weights = [finite_gltf_number(w) for w in node.get("weights", mesh.get("weights", []))]
         found = []
@@ -167,7 +173,10 @@ class _GltfReader:
         return _GltfPrimitive(name, faces, positions, normals, colour, uv, glow_uv)
 
     def _texture_coordinates(self, primitive: Mapping[str, Any], name: str, key: str) -> NDArray[np.float32] | None:
-        """Return the (V, 2) texture coordinates that a material's texture uses, v upward; None if they are missing."""
+        """Return the (V, 2) coordinates of a glTF primitive for one texture, v upward; None if they are missing.
+
+        ``name`` is the index of the material, as text. ``key`` is the texture's glTF name, e.g. "emissiveTexture".
+        """
         material = self.document.content["materials"][int(name)]
         texture = {**_gltf_base_colour(material), "emissiveTexture": material.get("emissiveTexture", {})}.get(key, {})
         moved = texture.get("extensions", {}).get("KHR_texture_transform", {})
@@ -183,7 +192,11 @@ class _GltfReader:
     def _pose_vertices(
         self, primitive: Mapping[str, Any], name: str, values: NDArray, weights: Sequence[float], pose: NDArray | None
     ) -> NDArray[np.float64]:
-        """Apply morph targets and skinning to (V, 3) positions or normals."""
+        """Apply morph targets, then skinning, to ``values`` (V, 3): positions or normals, as ``name`` says.
+
+        ``name`` is "POSITION" or "NORMAL". ``weights`` are those of the morph targets. ``pose`` has the (J, 4, 4) joint
+        matrices; None for no skinning.
+        """
         count = len(values)
         for weight, target in zip(weights, primitive.get("targets", []), strict=False):
             if weight and name in target:
@@ -209,7 +222,7 @@ class _GltfReader:
         return moved
 
     def _place_primitive(self, primitive: _GltfPrimitive, matrix: NDArray[np.float64]) -> Faces:
-        """Return a glTF primitive, transformed by ``matrix`` (4, 4) to scene coordinates."""
+        """Return the triangles of a glTF primitive, transformed by ``matrix`` (4, 4) to scene coordinates."""
         faces = primitive.faces
         with np.errstate(all="ignore"):
             positions = primitive.positions @ matrix[:3, :3].T + matrix[:3, 3]
@@ -271,7 +284,7 @@ class _GltfReader:
         return np.stack([matrices[joint] for joint in joints]) @ inverse
 
     def read_material(self, material: Mapping[str, Any]) -> Material:
-        """Read a material and its textures."""
+        """Convert a JSON material to :class:`Material`; the bytes of its textures are added to :attr:`images`."""
         base, extensions = _gltf_base_colour(material), material.get("extensions", {})
         factor = [finite_gltf_number(x) for x in base.get("baseColorFactor", (1.0, 1.0, 1.0))]
         mode = material.get("alphaMode", "OPAQUE")
@@ -321,9 +334,9 @@ class _GltfReader:
 
 
 def _gltf_base_colour(material: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a material's base colour and texture with the keys of ``pbrMetallicRoughness``.
+    """Return the base colour and texture of a JSON material under the keys of ``pbrMetallicRoughness``.
 
-    If a material also has the specular-glossiness extension, the extension's values are used.
+    If a material has the specular-glossiness extension, the extension's diffuse values are used instead.
     """
     glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
     if glossy is None:

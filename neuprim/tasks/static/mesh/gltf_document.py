@@ -38,7 +38,7 @@ _T = TypeVar("_T")
 
 
 def refuse_damaged_gltf(path: Path, function: Callable[[], _T]) -> _T:
-    """Call a function that reads a glTF document; convert exceptions that damaged documents cause to DataError."""
+    """Return ``function()``, which reads a glTF document; convert the exceptions of damaged documents to DataError."""
     try:
         return function()
     except _DAMAGE as error:
@@ -47,7 +47,7 @@ def refuse_damaged_gltf(path: Path, function: Callable[[], _T]) -> _T:
 
 
 def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
-    """Return the JSON and the binary chunk of a .glb file."""
+    """Return the JSON chunk and the binary chunk of a .glb file; the latter is None if the file has none."""
     magic, version, length, size, kind = struct.unpack_from("<5I", data)
     if magic != _GLB:
         raise ValueError(f"starts with {data[:4]!r}, not with b'glTF'")
@@ -119,7 +119,7 @@ class GltfDocument:
         return data
 
     def view(self, index: int) -> tuple[bytes, int]:
-        """Return bytes and stride (0: packed) of a buffer view."""
+        """Return the bytes of buffer view ``index``, and its stride in bytes, which is 0 for packed elements."""
         view = self.content["bufferViews"][to_gltf_index(index)]
         data = self._buffers[to_gltf_index(view["buffer"])]
         start, size = to_gltf_index(view.get("byteOffset", 0)), to_gltf_index(view["byteLength"])
@@ -128,9 +128,10 @@ class GltfDocument:
         return data[start : start + size], to_gltf_index(view.get("byteStride", 0))
 
     def array(self, index: int, kinds: Sequence[str], length: int | None = None) -> NDArray:
-        """Return (N, C) values of an accessor, whose type must be in ``kinds``.
+        """Return the (N, C) values of accessor ``index``; raise ValueError unless its type is in ``kinds``.
 
-        Normalized integers become floats 0..1 or -1..1.
+        ``kinds`` are glTF types such as "VEC3". If ``length`` is given, N must equal it. Normalized integers become
+        floats 0..1 or -1..1.
         """
         accessor = self.content["accessors"][to_gltf_index(index)]
         where, count, kind = f"accessors[{index}]", to_gltf_index(accessor["count"]), accessor["type"]
@@ -167,14 +168,14 @@ def parse_gltf_uri(uri: Any) -> str:
 
 
 def to_gltf_index(value: Any) -> int:
-    """Check that a JSON value is an index or a count, and return it. Negative numbers are refused."""
+    """Return a JSON value that is an index or a count; raise ValueError unless it is an integer of at least 0."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise ValueError(f"an index is {str(value)[:20]}")
     return value
 
 
 def finite_gltf_number(value: Any) -> float:
-    """Check that a JSON value is a finite number, and return it."""
+    """Return a JSON value as a float; raise ValueError if it is not finite."""
     number = float(value)
     if not math.isfinite(number):
         raise ValueError(f"a number is {number}")

@@ -1,7 +1,7 @@
-"""Read a mesh file and the files that it names, within size limits and only from the mesh file's folder.
+"""Data classes of a mesh file, a reader of its bytes with size limits, and the triangulation of polygons.
 
-Polygons are triangulated by fans, or by ear clipping where a fan would change the surface. Self-intersecting polygons
-are refused.
+Files that a mesh file refers to, such as textures, are read only from the mesh file's folder. Polygons are triangulated
+by fans, or by ear clipping where a fan would change the surface. Self-intersecting polygons are refused.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Model:
 
 
 def find_model_file(path: Path) -> Path:
-    """Return the mesh file ``path`` with ``~`` expanded; raises DataError if it is missing or of another type."""
+    """Return ``path`` with ``~`` expanded; raise DataError if the file is missing or its suffix is not supported."""
     try:
         file = path.expanduser()
         usable, there = file.is_file(), file.exists()
@@ -96,7 +96,10 @@ def find_model_file(path: Path) -> Path:
 
 
 class MeshFolder:
-    """Reader of a mesh file and of files below its folder, ``budget`` bytes at most; hashes all bytes that it reads."""
+    """Reader of a mesh file and of files below its folder: at most ``budget`` bytes in total. All bytes are hashed.
+
+    With ``skip_missing``, a missing optional file, such as a texture, causes a warning instead of an error.
+    """
 
     def __init__(self, file: Path, skip_missing: bool = False, budget: int = MAX_BYTES) -> None:
         self.file, self.skip_missing = file, skip_missing
@@ -108,21 +111,27 @@ class MeshFolder:
         return self._hash.hexdigest()
 
     def read_model(self) -> bytes:
-        """Read the mesh file itself."""
+        """Return the bytes of the mesh file itself; raise DataError if the file is empty."""
         data = self._read_within_budget(self.file, self.file.suffix.lower())
         if not data:
             raise DataError(f"{self.file}: file is empty; expected a mesh, {_SUFFIX_LIST}")
         return data
 
     def read_required(self, reference: str, what: str) -> bytes:
-        """Read a file that the mesh file needs; DataError if it is outside the folder, missing or too large."""
+        """Return the bytes of ``reference``, a file name or data URI in the mesh file; ``what`` is its name in errors.
+
+        Raises DataError if the file is outside the folder, missing or too large.
+        """
         found, fault = self._resolve_reference(reference, what)
         if found is None:
             raise DataError(fault)
         return found
 
     def read_optional(self, references: Sequence[str], what: str) -> bytes | None:
-        """Read the first of ``references`` that exists; else raise DataError or, with ``skip_missing``, return None."""
+        """Return the bytes of the first of ``references`` that exists.
+
+        If none exists, the result is None with ``skip_missing``; otherwise, the method raises DataError.
+        """
         faults = []
         for reference in references:
             found, fault = self._resolve_reference(reference, what)
@@ -136,7 +145,7 @@ class MeshFolder:
         return None
 
     def _resolve_reference(self, reference: str, what: str) -> tuple[bytes | None, str]:
-        """Read the file or data URI ``reference``; return its bytes and "", or None and the reason for the refusal."""
+        """Return (bytes, "") of the file or data URI ``reference``, or (None, reason) if it is refused or missing."""
         shown = reference if len(reference) <= 80 else reference[:77] + "..."
         if reference.startswith("data:"):
             return self._decode_data_uri(reference, what), ""
@@ -190,7 +199,7 @@ def check_mesh_limits(path: Path, counts: Mapping[str, tuple[int, int]]) -> None
 
 
 def check_vertices(path: Path, positions: NDArray[np.float64], faces: NDArray[np.integer]) -> None:
-    """Raise DataError if an index in ``faces`` is out of range, or its row of ``positions`` (V, 3) is not finite."""
+    """Raise DataError if an index in ``faces`` is out of range, or its vertex in ``positions`` (V, 3) is not finite."""
     if not faces.size:
         return
     low, high = int(faces.min()), int(faces.max())
@@ -213,7 +222,7 @@ _FLAT = 1e-10  # twice an area over the squared extent of the polygon, up to whi
 def triangulate_polygons(
     path: Path, corners: NDArray[np.float64], sizes: NDArray[np.integer]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Triangulate polygons; return (T, 3) rows of ``corners`` and (T,) ascending polygon indices.
+    """Triangulate polygons; return (T, 3) indices into ``corners``, and (T,) the polygon of each triangle, ascending.
 
     ``corners`` (C, 3) are the finite corners of all polygons, concatenated; ``sizes`` (P,) is the number of corners of
     each polygon. Raises DataError for self-intersecting polygons.
@@ -271,22 +280,23 @@ def triangulate_polygons(
 
 
 def _polygon_triangle_fan(size: int, start: int) -> NDArray[np.intp]:
-    """Return (size - 2, 3) corner indices: the triangle fan of a polygon around its corner ``start``."""
+    """Return (size - 2, 3) corner indices: the triangle fan of a ``size``-sided polygon around its corner ``start``."""
     around = (start + np.arange(1, size)) % size
     return np.stack([np.full(size - 2, start), around[:-1], around[1:]], axis=1)
 
 
 def _flatten_polygon(points: NDArray, normal: NDArray) -> NDArray[np.float64]:
-    """Project a polygon along its normal to (size, 2) points, counterclockwise."""
+    """Project a polygon's corners (M, 3) along its unit ``normal``; return (M, 2) corners, counterclockwise."""
     side = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     side /= np.linalg.norm(side)
     return np.stack([points @ side, points @ np.cross(normal, side)], axis=1)
 
 
 def _cut_ears(points: NDArray[np.float64], tests: int) -> tuple[NDArray[np.int64] | None, int]:
-    """Triangulate a polygon by ear clipping (Meisters 1975), with at most ``tests`` tests of ears.
+    """Triangulate a plane polygon (M, 2) by ear clipping (Meisters 1975).
 
-    Return (T, 3) corner indices, or None on failure, and the number of tests that are left.
+    Return (T, 3) corner indices, or None on failure, and what is left of ``tests``. Every test whether a corner can be
+    cut off reduces ``tests`` by one, or by more in large polygons. Below zero, the triangulation fails.
     """
     left, found = list(range(len(points))), []
     place, strict, failed = 0, True, 0

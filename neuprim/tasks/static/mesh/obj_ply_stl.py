@@ -1,4 +1,4 @@
-"""Readers of OBJ with material libraries (.mtl), PLY with colours or a texture, and STL.
+"""Readers of mesh files: OBJ with material libraries (.mtl), PLY with colours or a texture, and STL.
 
 Textures and colours (also those of STL files) are sRGB. Counts in headers are checked before memory is allocated.
 """
@@ -42,7 +42,7 @@ _NONE = -1  # index of missing texture coordinates or normals
 
 
 def read_obj(folder: MeshFolder) -> Model:
-    """Read an .obj file and its material libraries; raises DataError as :class:`MeshFolder` does."""
+    """Read an .obj file and its material libraries; raise DataError if a file is missing, refused or too large."""
     text = folder.read_model().decode("utf-8", "replace")
     found = {"vertices": (text.count("\nv "), MAX_VERTICES), "faces": (text.count("\nf "), MAX_FACES)}
     check_mesh_limits(folder.file, {**found, "changes of material": (text.count("usemtl "), MAX_PARTS)})
@@ -121,7 +121,11 @@ def _look_up_obj_corners(table: NDArray[np.float64], index: NDArray[np.int64], m
 
 
 def _obj_number_table(key: str, numbers: NDArray[np.float64], lengths: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Return the numbers on the N lines that start with ``key`` as N rows; missing ones are NaN, or 0 for ``vt``."""
+    """Return a table with the numbers of the N lines that start with ``key`` ("v", "vt" or "vn"), one row per line.
+
+    ``numbers`` are those of all N lines, concatenated; ``lengths`` (N,) is their count per line. Missing numbers are
+    NaN, or 0 for "vt".
+    """
     width = min(max(2, int(lengths.max(initial=2))), _WIDTHS[key][1])
     table = np.full((len(lengths), width), 0.0 if key == "vt" else np.nan)
     first = np.cumsum(lengths) - lengths
@@ -132,7 +136,7 @@ def _obj_number_table(key: str, numbers: NDArray[np.float64], lengths: NDArray[n
 
 
 def _obj_vertex_colours(path: Path, v: NDArray[np.float64]) -> NDArray[np.float32] | None:
-    """Return (V, 3) vertex colours 0..1, the values after x y z; None unless all vertices have a colour."""
+    """Return (V, 3) vertex colours 0..1, the columns of ``v`` after x, y, z; None unless all vertices have a colour."""
     if v.shape[1] < 6:
         return None
     found = v[:, 3:6]
@@ -180,7 +184,7 @@ def _read_mtl_library(text: str, folder: MeshFolder, images: dict[str, bytes]) -
 
 
 def _finish_mtl_material(material: Material) -> Material:
-    """Finish a material: white where a texture replaces the colour, and no emission if its strength is zero."""
+    """Return the final form of a .mtl material: a colour that a texture replaces is white, black emission is None."""
     white = (1.0, 1.0, 1.0)
     glow = material.glow
     if glow is not None and glow.texture is not None:
@@ -191,7 +195,11 @@ def _finish_mtl_material(material: Material) -> Material:
 
 
 def _read_mtl_texture(words: list[str], rest: str, folder: MeshFolder, images: dict[str, bytes]) -> Material | None:
-    """Read a .mtl file's texture with wrap mode and transform; None if it is missing and ``skip_missing`` is set."""
+    """Read the texture of a .mtl line into ``images``; return a material with its name, wrap mode and transform.
+
+    ``rest`` is the line without its key, ``words`` the same text split at blanks. The result is None if the file is
+    missing and ``skip_missing`` is set.
+    """
     image, options = _mtl_texture_file_name(words, rest)
     spellings = [image, PurePosixPath(image.replace("\\", "/")).name]
     if image not in images:
@@ -207,7 +215,10 @@ def _read_mtl_texture(words: list[str], rest: str, folder: MeshFolder, images: d
 
 
 def _mtl_texture_file_name(words: list[str], rest: str) -> tuple[str, dict[str, tuple[float, float]]]:
-    """Split a .mtl texture line into the file name, which may contain blanks, and the options before it."""
+    """Split a .mtl texture line into the file name, which may contain blanks, and option -> its first two numbers.
+
+    ``rest`` is the line without its key, ``words`` the same text split at blanks. Options precede the name.
+    """
     place, last = 0, len(words) - 1
     options: dict[str, tuple[float, float]] = {}
     while place < last and words[place] in {*_NUMBERS, *_WORDS}:
@@ -331,8 +342,8 @@ def _ply_mesh_colours(element: PlyElement, path: Path) -> NDArray[np.float32] | 
 def read_stl(folder: MeshFolder) -> Model:
     """Read an .stl file.
 
-    The file is read as binary if its length matches the face count at byte 80, else as text, whatever its first bytes
-    are.
+    The file is read as binary if its length matches the face count at byte 80, even if it starts with "solid". Else it
+    is read as text.
     """
     data = folder.read_model()
     count = int.from_bytes(data[80:84], "little")
@@ -360,7 +371,11 @@ def _read_stl_text(path: Path, data: bytes) -> tuple[list[Faces], int]:
 
 
 def _read_stl_binary(path: Path, data: bytes) -> tuple[list[Faces], int]:
-    """Parse a binary .stl file with the colours of VisCAM (bit 15 is set) or of Materialise Magics (COLOR=)."""
+    """Parse a binary .stl file: return all triangles and the number of corners.
+
+    Face colours are read in two formats: VisCAM (bit 15 of a face's attribute marks a colour) and Materialise Magics
+    (the header contains "COLOR=").
+    """
     rows = np.frombuffer(data, _STL, offset=84)
     bits = rows["attribute"].astype(np.int64)
     fives = np.stack([(bits >> shift & 31) / 31 for shift in (10, 5, 0)], axis=-1)

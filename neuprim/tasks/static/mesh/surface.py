@@ -1,4 +1,4 @@
-"""Mesh for ray casting: triangles with colours, opacity and filtered textures, fitted into the unit box."""
+"""Mesh for ray casting: triangles with colours, opacity and filtered textures, scaled to fit into [-1, 1]^3."""
 
 from __future__ import annotations
 
@@ -51,7 +51,10 @@ class SurfacePart:
 
 
 def read_surfaces(model: Model) -> list[SurfacePart]:
-    """Parse the geometry and colours of a mesh; raises DataError if it is damaged or has no or too many triangles."""
+    """Return the triangles of a mesh with their final colours, in parts of one material each.
+
+    Raises DataError if the mesh is damaged, or has no or too many triangles.
+    """
     faces, vertices = model.read_faces()
     count = sum(len(part.corners) for part in faces)
     if not count:
@@ -92,7 +95,10 @@ def _make_surface_part(model: Model, faces: Faces) -> SurfacePart:
 def _texture_coordinates(
     model: Model, uv: NDArray[np.floating] | None, material: Material, faces: int
 ) -> NDArray[np.float32] | None:
-    """Return (F, 3, 2) texture coordinates of the faces' corners; None without a texture or coordinates."""
+    """Return the (F, 3, 2) ``uv`` after the material's texture transform; None if texture or ``uv`` are missing.
+
+    ``faces`` is the number F. It is used in the warning about missing coordinates.
+    """
     if material.texture is None:
         return None
     if uv is None:
@@ -120,7 +126,7 @@ _ROWS = 256
 
 
 class MeshTexture:
-    """A mip-mapped texture, (H, W, 4) uint8 sRGB with straight alpha. Each level has half the size of the last."""
+    """A mip-mapped texture, (H, W, 4) uint8 sRGB with straight alpha. Each level has half the size of the previous."""
 
     def __init__(self, pixels: NDArray[np.uint8], wrap: tuple[str, str] = ("repeat", "repeat")) -> None:
         self.wrap = wrap
@@ -137,7 +143,10 @@ class MeshTexture:
         return self.levels[0][..., 3]
 
     def look_up(self, uv: NDArray[np.float32], blur: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return (M, 4) linear RGBA at (M, 2) ``uv``, v upward; ``blur`` (M,) is the ray width in texels."""
+        """Return (M, 4) linear RGBA at (M, 2) ``uv``, v upward.
+
+        ``blur`` (M,) is the width of each ray at the surface, in texels; it selects the mip level.
+        """
         level = np.clip(np.round(np.log2(np.maximum(blur, 1.0))), 0, len(self.levels) - 1).astype(np.intp)
         found = np.empty((len(uv), 4), dtype=np.float32)
         for index in np.unique(level):
@@ -228,9 +237,10 @@ _Z_FROM_Y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
 def scene_from_mesh_file(parts: Sequence[SurfacePart], upward: Up) -> NDArray[np.float64] | None:
-    """Return (4, 4) scene_from_file of a mesh: z up, centred, and scaled to fit into [-1, 1]^3 and all images.
+    """Return the (4, 4) matrix from the axes of a mesh file to scene coordinates.
 
-    The result is None if the mesh's size is 0 or out of range.
+    The mesh gets z up, is centred, and is scaled to fit into [-1, 1]^3 and into all images. The result is None if the
+    size of the mesh is 0 or out of range.
     """
     turn = _Z_FROM_Y if upward == "y" else np.eye(3)
     lower = np.min([part.corners.min(axis=(0, 1)) for part in parts], axis=0)
@@ -247,7 +257,10 @@ def scene_from_mesh_file(parts: Sequence[SurfacePart], upward: Up) -> NDArray[np
 
 
 class MeshSurface(Scene):
-    """Mesh for ray casting. ``spacing`` is the distance of neighbouring rays at distance 1 from the camera."""
+    """Mesh for ray casting, in scene coordinates.
+
+    ``spacing`` is the distance between neighbouring rays at distance 1 from the camera; textures are filtered to it.
+    """
 
     def __init__(
         self, model: Model, parts: Sequence[SurfacePart], upward: Up, spacing: float, engine: Engine = "auto"
@@ -290,7 +303,7 @@ class MeshSurface(Scene):
         self._holes = bool((self._cutoff > 0).any())
 
     def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
-        """Return the first hits as :meth:`Scene.intersect` does, with normals on the visible side."""
+        """Return the first hits as :meth:`Scene.intersect` does; normals point to the side that the ray comes from."""
         hits = super().intersect(origins, directions)
         towards = np.asarray(directions, dtype=np.float32)[hits.hit]
         side = np.where(shading_dot(hits.face, towards) > 0, np.float32(-1), np.float32(1))[:, None]
@@ -301,7 +314,7 @@ class MeshSurface(Scene):
         return replace(hits, normal=side * hits.normal, face=side * hits.face, albedo=albedo, emission=emission)
 
     def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
-        """Return occlusion as :meth:`Scene.occluded` does, but light passes through holes in textures."""
+        """Return (N,) bool: whether the mesh blocks each segment, as :meth:`Scene.occluded`; holes do not block."""
         if not self._holes:
             return super().occluded(points, directions, distance)
         d = np.ascontiguousarray(directions, dtype=np.float32)
@@ -329,7 +342,10 @@ class MeshSurface(Scene):
         return triangle, u, v, distance
 
     def _is_hole(self, triangle: NDArray, u: NDArray, v: NDArray, distance: NDArray) -> NDArray[np.bool_]:
-        """Return (M,) bool: whether the alpha of each hit is below the material's cutoff."""
+        """Return (M,) bool: whether each hit is a hole of the mesh, where alpha is below the material's cutoff.
+
+        A hit is given by its triangle, its barycentric coordinates ``u`` and ``v``, and its distance along the ray.
+        """
         weight = np.stack([1 - u - v, u, v], axis=1, dtype=np.float32)
         cutoff = self._cutoff[triangle]
         able = np.flatnonzero(cutoff > 0)
@@ -339,9 +355,10 @@ class MeshSurface(Scene):
 
 
 class _MeshColourLayer:
-    """Colours of the faces for which ``kept`` (F,) is true: interpolated corner colours times textures.
+    """Colours at hits on faces whose ``kept`` (F,) is true: interpolated corner colours times textures.
 
-    ``area`` (F,) is twice the area of each face, in units of the squared distance between rays.
+    ``area`` (F,) is twice the area of each face, divided by the squared distance of neighbouring rays at distance 1
+    from the camera. ``pool`` shares decoded textures between layers.
     """
 
     def __init__(
@@ -370,7 +387,10 @@ class _MeshColourLayer:
         self._blur = np.sqrt(inside * texels[self._texture] / area[kept]).astype(np.float32)
 
     def sample_colours(self, triangle: NDArray, weight: NDArray[np.float32], distance: NDArray) -> NDArray[np.float32]:
-        """Return (M, 4) linear RGB and alpha of hits on triangles (M,) with barycentric weights (M, 3)."""
+        """Return (M, 4) linear RGB and alpha of hits on triangles (M,) with barycentric weights (M, 3).
+
+        ``distance`` (M,) is that of each hit from the ray's origin; textures are blurred in proportion to it.
+        """
         found: NDArray[np.float32] = np.einsum("nk,nkc->nc", weight, self._colour[triangle])
         texture = self._texture[triangle]
         for index in np.unique(texture[texture >= 0]):
@@ -381,7 +401,7 @@ class _MeshColourLayer:
 
 
 def _transparent_faces(part: SurfacePart) -> NDArray[np.bool_]:
-    """Return (F,) bool: whether a face's alpha is below the cutoff at all corners."""
+    """Return (F,) bool: whether a face is invisible, since its alpha is below the material's cutoff at all corners."""
     if part.alpha is None or part.material.cutoff is None:
         return np.zeros(len(part.colour), dtype=np.bool_)
     clear: NDArray[np.bool_] = part.alpha.max(axis=1) < part.material.cutoff
@@ -403,7 +423,10 @@ def _warn_of_translucent_faces(model: Model, parts: Sequence[SurfacePart], pool:
 
 
 def _separate_crowded_vertices(points: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trimesh:
-    """Duplicate vertices that too many faces share, so that each of these faces gets its own normal."""
+    """Return a mesh in which vertices that more than 64 faces share are duplicated, one copy per corner.
+
+    The cost of smooth normals grows with the square of the faces at a vertex; faces at a copy get their own normals.
+    """
     around = np.bincount(faces.ravel(), minlength=len(points))
     crowded = around[faces] > _MOST_AROUND
     alone = faces[crowded]
@@ -415,9 +438,10 @@ def _separate_crowded_vertices(points: NDArray[np.float64], faces: NDArray[np.in
 def _smooth_normals(
     given: NDArray[np.float64], across: NDArray[np.float64], mesh: trimesh.Trimesh
 ) -> NDArray[np.float64]:
-    """Return (F, 3, 3) unit normals: ``given`` flipped to the face's side, or else :func:`solid_corner_normals`.
+    """Return (F, 3, 3) unit corner normals: the file's normals, or :func:`solid_corner_normals` where it has none.
 
-    ``given`` are the file's normals; ``across`` (F, 3) are the face normals.
+    ``given`` (F, 3, 3) are the file's normals, 0 for missing ones; they are flipped to the side to which the face
+    normal points. ``across`` (F, 3) are the face normals, of any length.
     """
     with np.errstate(all="ignore"):
         length = np.linalg.norm(given, axis=2, keepdims=True)

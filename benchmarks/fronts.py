@@ -103,9 +103,9 @@ def reach(result: Mapping[str, Any], front: str, cost: str) -> float:
 def report(name: str, result: Mapping[str, Any]) -> str:
     """Prints the table of a scene; returns it with what is said about it."""
     title = (
-        f"**{SCENES[name].title}** (`{' '.join(result['words'])}`): {reach(result, 'speed', 'time_ratio'):.1f} times "
-        f"in "
-        f"the time of a frame, {reach(result, 'size', 'bytes'):.0f} times in bytes. {result['length']}"
+        f"**{SCENES[name].title}** (`{' '.join(result['words'])}`): the slowest model of its front needs "
+        f"{reach(result, 'speed', 'time_ratio'):.1f} times as long for a frame as the fastest, the largest has "
+        f"{reach(result, 'size', 'bytes'):.0f} times as many bytes as the smallest. {result['length']}"
     )
     print(f"\n{title}\n")
     models = result["models"]

@@ -231,9 +231,10 @@ class _RunRenderSession:
         return _view_file_names([Path(self.request.camera.partition("#")[0]).resolve().stem])[0]
 
     def _choose_frames(self) -> tuple[list[int], Mapping[str, str]]:
-        """Return the source frame numbers that ``--frame`` names, and the conditions with the times of these frames.
+        """Return the source frame numbers that ``--frame`` names, and the texts of options such as ``--time``.
 
-        Without ``--frame``, return no numbers and the conditions as the user gave them.
+        With ``--frame``, the text of ``--time`` lists the times of these frames. Without it, return no numbers and the
+        texts as the user gave them.
         """
         text, conditions = self.request.frame, self.request.conditions
         if text is None:

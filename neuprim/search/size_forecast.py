@@ -297,10 +297,11 @@ class SizePredictor:
         return to_forecast_decibels(name, attempt.measured(name)) - loss
 
     def margins(self) -> list[tuple[int, float]]:
-        """Return a pair (primitives, margin) for every number of primitives that was trained.
+        """Return a pair (primitives, margin in dB) for every number of primitives that was trained.
 
-        A forecast is limited to the range between the margins of smaller and larger full runs. Between a full run that
-        misses the target and one that meets it, forecasts are left out.
+        The margin is the quality minus the target. A training of full length (a full run) has measured it; for shorter
+        trials it is a forecast. Forecasts are clamped between the margins of the next smaller and larger full runs, and
+        left out between a full run that misses the target and one that meets it.
         """
         margins = {
             n: self.margin({name: from_forecast_decibels(name, f.value) for name, f in values.items()})

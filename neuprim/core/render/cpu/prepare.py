@@ -145,10 +145,13 @@ def _is_finite_undrawn_primitive(i, parameters, most):  # type: ignore[no-untype
 
 @strict
 def _silhouette_screen_extent(z, ci, s22, square, b, axes, towards, focal, middle):  # type: ignore[no-untyped-def]
-    """Return the pixel range along a screen axis of an ellipsoid's silhouette, after scaling it by ``square`` ** 0.5.
+    """Return the pixel range along a screen axis of the silhouette of an ellipsoid, scaled by ``square`` ** 0.5.
 
-    Uses the tangents of ``screen_boxes`` in the reference, in units of m. ``b`` and ``towards`` are the rows of B (the
-    orientation in camera axes) for the screen axis and for depth, and ``s22`` is S_zz of the unscaled ellipsoid.
+    The range lies between the tangents to the silhouette, as in ``screen_boxes`` of the float64 reference renderer.
+    Lengths are in units of the ellipsoid's longest semi-axis. ``z`` and ``ci`` are the centre's camera coordinates in
+    depth and along the screen axis, ``axes`` are the semi-axes, ``middle`` is the principal point. ``b`` and
+    ``towards`` are the rows of the orientation matrix, in camera axes, for the screen axis and for depth. ``s22`` is
+    the variance in depth of the unscaled ellipsoid's matrix B diag(s^2) B^T.
     """
     (b0, b1, b2), (s0, s1, s2), (d0, d1, d2), szz = b, axes, towards, square * s22
     sii = square * ((b0 * s0) ** 2 + (b1 * s1) ** 2 + (b2 * s2) ** 2)

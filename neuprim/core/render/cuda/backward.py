@@ -350,7 +350,10 @@ def uncomposite_kernel(form: KernelForm, depth: bool) -> Any:
 
 @dataclass
 class ImageGradient:
-    """The gradient dL/d(image), float32 and contiguous, and a given error of each pixel, used for contributions."""
+    """The gradient of the loss by the image, float32 and contiguous, and an error per pixel.
+
+    The backward pass adds up the errors that each primitive contributes to; population control uses these sums.
+    """
 
     rgb: Tensor  # (H W, C)
     transmittance: Tensor | None  # (H W,), without the background's share

@@ -125,7 +125,8 @@ class Ray:
 class Chord:
     """The part of a pixel's ray inside a primitive, in whitened space (where the primitive is the unit sphere).
 
-    t is in units of m, from an origin moved along the ray by ``slide``.
+    Positions on the ray are counted from an origin that is moved along the ray by ``slide``, in units of the
+    primitive's longest semi-axis m.
     """
 
     du: float  # pixel offset from the anchor

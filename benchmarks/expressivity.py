@@ -191,8 +191,8 @@ def gaussian_table(trials: Sequence[Run]) -> str:
     )
     table = make_table(columns, [runs for _, runs in ordered])
     return (
-        f"{table}\n\nReduced: solids at 64×64, the folder's images averaged down 4 times, {SMALL_STEPS} steps of every "
-        "form (not equal seconds: the backends differ)."
+        f"{table}\n\nA small version of the comparison: solids at 64×64, the folder's images reduced by a factor of 4, "
+        f"and {SMALL_STEPS} steps of every form, as seconds of different backends cannot be compared."
     )
 
 

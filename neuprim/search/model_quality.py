@@ -110,7 +110,7 @@ class SearchQuality:
 
     @classmethod
     def of_run(cls, config: RunConfig, dataset: Dataset) -> SearchQuality:
-        """Return the quality measure of a run; it includes the extinction if the run was trained on voxels."""
+        """Return the quality measure of a run. If it was trained on voxels, errors of the extinction count, too."""
         return cls(dataset, config.renderer, config.train.supervision != "images")
 
     def __call__(self, model: Primitives, quick: bool = False) -> float:

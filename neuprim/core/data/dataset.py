@@ -282,7 +282,7 @@ def hold_out_views(dataset: Dataset, every: int) -> Dataset:
     count = len(dataset.train)
     if every < 2 or count < 2:
         found = f"cannot hold out one in {every} of {count} training views"
-        raise ConfigError(f"{dataset.name}: {found}; expected at least 2 views, and at most every second one held out")
+        raise ConfigError(f"{dataset.name}: {found}; expected at least 2 views, and one in 2 or more")
     test = [i for i in range(count) if i % every == i // every % every]
     train = [i for i in range(count) if i % every != i // every % every]
     return replace(dataset, train=ViewSubset(dataset.train, train), test=ViewSubset(dataset.train, test))

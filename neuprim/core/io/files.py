@@ -261,7 +261,8 @@ class StagedOutput:
 def staged_output(final: Path, overwrite: bool) -> Iterator[StagedOutput]:
     """Yield a :class:`StagedOutput` whose temporary folder is deleted after the block.
 
-    The block must call :meth:`StagedOutput.publish`. Its errors name final instead of temporary paths.
+    The block must call :meth:`StagedOutput.publish`. In errors raised in the block, the paths of temporary files are
+    replaced by those of the final files.
     """
     existing = final if final.is_dir() else next(p for p in (*final.parents, Path(".")) if p.exists())
     try:

@@ -38,7 +38,7 @@ class LayerFrame:
 
     @cached_property
     def lowered(self) -> LoweredPrimitives:
-        """The primitives at the conditions of the frame, with closed forms of density and colour."""
+        """The primitives of the frame: the coefficients of their densities and colours that the renderer integrates."""
         with torch.no_grad():
             return self.model.lower(self.camera, self.conditions, self.settings)
 

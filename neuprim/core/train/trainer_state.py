@@ -112,6 +112,6 @@ def check_training_settings(settings: TrainSettings, model: Primitives, dataset:
     if settings.exposure_rate > 0 and dataset.train.pixels(0).alpha is not None:
         raise ConfigError(
             f"train.exposure_rate={settings.exposure_rate:g}: images of {dataset.name} have alpha; expected opaque "
-            "photographs, as a gain would change the background that is put behind them"
+            "photographs, because a learned exposure would also change the background. Set train.exposure_rate=0."
         )
     return settings

@@ -108,10 +108,11 @@ def project_block(S, view):  # type: ignore[no-untyped-def]
 
 @strict
 def _whiten_axis(b, s, u, v, fx, fy, w):  # type: ignore[no-untyped-def]
-    """Return E0, EX, EY and XA, the numbers of a primitive's rays, along one axis of the ellipsoid.
+    """Return the parts along one ellipsoid axis of four vectors in whitened space, where the ellipsoid is a unit ball.
 
-    ``b`` is the axis's column of B (orientation in camera axes), and ``s`` its length over m. ``b`` / ``s`` is a row of
-    m S^-1 B^T, the matrix from camera axes to whitened axes.
+    They are E0, the direction of the ray at (``u``, ``v``) on the image plane z = 1; EX and EY, the changes of the
+    direction per pixel; and XA, the vector ``w``. ``b`` is the axis in camera axes, ``s`` the semi-axis divided by the
+    longest semi-axis, and ``fx``, ``fy`` are focal lengths in pixels.
     """
     a0, a1, a2 = b[0] / s, b[1] / s, b[2] / s
     return a0 * u + a1 * v + a2, a0 / fx, a1 / fy, dot3((a0, a1, a2), w)
@@ -189,7 +190,7 @@ def fill_block(which, n, parameters, view, S, waves):  # type: ignore[no-untyped
 
 @strict
 def store_row(k, S, waves, rate, order, row):  # type: ignore[no-untyped-def]
-    """Copy primitive ``k`` of a block to ``row``, with neurons sorted by rising rate (speed of phase).
+    """Copy primitive ``k`` of a block to ``row``, with neurons sorted by rate (phase per length along the ray).
 
     Also fills ``rate`` with the sorted rates and ``order`` with the neurons' indices.
     """

@@ -100,7 +100,10 @@ def row_spans(
 
 @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
 def list_float64_pairs(starts: Ints, counts: Ints2d, ends: Longs2d, found: Ints):
-    """Write the pairs that need float64 to ``found``, in order; ``ends`` are the running sums of ``counts``."""
+    """Write the indices of pairs (a tile and a primitive) that float64 code draws to ``found``, in order.
+
+    ``counts[1]`` is 1 for these pairs, ``ends`` are the running sums of ``counts``.
+    """
     n = wp.tid()
     if counts[1, n] > 0 and n < starts[starts.shape[0] - 1]:  # a refused frame has no pairs
         found[int(ends[1, n]) - 1] = n

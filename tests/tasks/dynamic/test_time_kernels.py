@@ -10,7 +10,8 @@ from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.fields import Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext
-from neuprim.tasks.dynamic.time_density import TimeDensity, apply_time_window, move_means, rows_in_time_window
+from neuprim.tasks.dynamic.time_density import TimeDensity
+from neuprim.tasks.dynamic.time_kernels import apply_time_window, move_means, rows_in_time_window
 
 pytestmark = pytest.mark.usefixtures("either_way")
 

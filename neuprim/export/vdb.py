@@ -96,7 +96,7 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
     sampler = _VdbExportSampler(job, _exported_component(job, placement), scene_from_world, name, factor, threshold)
     moving = choose_velocity(job, sampler.model, [f.conditions for f in frames], scene_from_world)
     look = choose_look(job, frames[0].conditions, per_world, scene_from_world)
-    whole = _VdbExportSampler(job, job.run.model, scene_from_world, name, factor, threshold)
+    whole = sampler._replace(model=job.run.model)
     metadata = {"neuprim_units": units, "neuprim_sigma_per_unit": 1 / factor, "neuprim_threshold": threshold}
     errors: dict[str, float] = {}
     for i, (frame, path) in enumerate(zip(frames, paths, strict=True)):
@@ -108,7 +108,7 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
         grid = sampler.sample_grid(frame.conditions, transform)
         vectors = []
         if look is not None:  # flames glow where the exported extinction may be 0
-            lit = whole.sample_grid(frame.conditions, transform)
+            lit = grid if sampler.model is whole.model else whole.sample_grid(frame.conditions, transform)
             vectors += look.sample_grids(job.run.model, frame.conditions, replace(lit, half=job.flag("half")))
         if placement is not None and placement.extents:
             extents = placement.extents  # for a time between frames, the extent of all

@@ -67,7 +67,7 @@ class LookExport:
 
     Attributes:
         names: the grids to write.
-        exposure: the radiance that the value 1 of a training image stands for.
+        exposure: the radiance of a pixel whose value in a training image is 1.
         per_world: scene units per world unit.
         scene_from_world: (4, 4) float64 transform from world to scene coordinates.
         threads: number of threads, 0 for all cores.

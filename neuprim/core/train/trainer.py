@@ -106,8 +106,10 @@ class Trainer:
         self.max_screen_size = None if size is None else MaxScreenSize(train, size)
         self.exposures = Exposures(len(train), dataset.channels, rate, self.device) if rate > 0 else None
         refine = dataset.refine
-        poses = torch.stack([camera.viewmat for camera in cameras])
-        self.corrections = ViewCorrections(poses, refine, dataset.extent, self.device) if refine else None
+        self.corrections: ViewCorrections | None = None
+        if refine:
+            poses = torch.stack([camera.viewmat for camera in cameras])
+            self.corrections = ViewCorrections(poses, refine, dataset.extent, self.device)
         self.covered_pixels = count_covered_pixels(train) if settings.stride == "auto" else 0.0
         self.generator = torch.Generator().manual_seed(seed + 1)
         self.order, self.step, self.elapsed = torch.empty(0, dtype=torch.int64), 0, 0.0

@@ -98,7 +98,7 @@ class Optics:
         kelvin: temperatures of the coldest and the hottest flame.
         emission: radiance of the hottest flame; 0 for no glow.
         flame_extinction: extinction per unit of f.
-        fire_lights: number of point lights that stand for the flames of a frame and light its smoke, e.g. 16; 0: flames
+        fire_lights: number of point lights that represent the flames of a frame and light its smoke, e.g. 16; 0: flames
             do not light the smoke.
         color_grid: name of a vec3s grid that multiplies the albedo, clamped to 0..1; null for none.
         gradient: RGB from the bottom to the top of the unit box, where a file has no ``color_grid``; null for none.
@@ -128,8 +128,8 @@ class Optics:
     def octave_share(self) -> float:
         """Strength of each further octave of scattered light, relative to the one before: half the mean albedo.
 
-        An octave approximates one more order of multiple scattering. With two to four octaves, images come close to
-        path tracing for albedos of 0.45 to 0.99 and thin to dense smoke (benchmarks/multiple_scattering.py).
+        An octave approximates one more order of multiple scattering. benchmarks/multiple_scattering.py compares images
+        with path tracing, for an albedo of 0.9.
         """
         return min(sum(self.albedo) / 6, 1.0)
 

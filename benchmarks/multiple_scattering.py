@@ -45,7 +45,7 @@ from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
 RECORD = RESULTS / "multiple_scattering.json"
 LIGHTS, OCTAVES, TRAINED = 4, (1, 2, 3, 4), (1, 2, 3)
 FIRE_LIGHTS, ALL_FIRE_LIGHTS, _GLOW = (0, 1, 4, 16, 64), 256, 1.5
-_DEPTH = 128  # most scatterings of a path
+_DEPTH = 128  # most segments of a path
 _LOOK = (
     "scene.look=smoke_fire",
     "scene.optics.albedo=[0.9,0.9,0.9]",
@@ -55,8 +55,10 @@ _LOOK = (
 )
 
 
-def trace_medium(medium: Medium, light: Light, camera: Camera, samples: int, seed: int) -> Tensor:
-    """Path trace a medium under a light at infinity: (H, W, 3) linear radiance."""
+def trace_medium(
+    medium: Medium, light: Light, camera: Camera, samples: int, seed: int, anisotropy: float = 0.0, depth: int = _DEPTH
+) -> Tensor:
+    """Path trace a medium under a light at infinity, with at most ``depth`` path segments: (H, W, 3) linear radiance."""
     import mitsuba  # only where it is needed: tables are made without it
 
     mitsuba.set_variant("scalar_rgb")
@@ -79,7 +81,7 @@ def trace_medium(medium: Medium, light: Light, camera: Camera, samples: int, see
     scene = mitsuba.load_dict(
         {
             "type": "scene",
-            "integrator": {"type": "volpath", "max_depth": _DEPTH, "rr_depth": 32},
+            "integrator": {"type": "volpath", "max_depth": depth, "rr_depth": 32},
             "camera": {
                 "type": "perspective",
                 "fov": math.degrees(2 * math.atan(camera.width / 2 / float(camera.fx))),
@@ -101,7 +103,7 @@ def trace_medium(medium: Medium, light: Light, camera: Camera, samples: int, see
                     "type": "heterogeneous",
                     "sigma_t": grid(sigma),
                     "albedo": grid(albedo),
-                    "phase": {"type": "isotropic"},
+                    "phase": {"type": "hg", "g": anisotropy},
                 },
             },
         }

@@ -145,10 +145,11 @@ class _ShadingUnderTest(ColourField):
     Shading has no gradient, so it must not change with parameters, or finite differences would include the change.
     """
 
-    def __init__(self, model: Primitives, conditions: Conditions) -> None:
+    def __init__(self, model: Primitives, view: View) -> None:
         self.colour, self.channels = model.colour, model.colour.channels
         with torch.no_grad():
-            self.shading = self.colour.shade(*model.lower_density(conditions), conditions, RenderSettings())
+            lowered = model.lower_density(view.conditions)
+            self.shading = self.colour.shade(*lowered, view.camera, view.conditions, RenderSettings())
 
     def parameters(self) -> list[ParameterSpec]:
         return self.colour.parameters()
@@ -189,7 +190,7 @@ def check_gradients_conformance(t: TaskUnderTest) -> None:
             t.require_finite(where, value.grad)
             t.require(bool(value.grad.any()), where, "zero in all views", "other than zero")  # type: ignore[union-attr]
     for view in t.double_views[:2]:
-        frozen = Primitives(model.density, _ShadingUnderTest(model, view.conditions), model.params)
+        frozen = Primitives(model.density, _ShadingUnderTest(model, view), model.params)
         params = _leaf_parameters_under_test(frozen)
         _conformance_objective(frozen, view, 0).backward()
         for name, value in params.items():

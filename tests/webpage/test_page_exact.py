@@ -169,10 +169,10 @@ def test_relit_models(hidden: int, visibility: str, falloff: bool, chromium: Any
     assert_equal_under_lights(model, bound, chromium, tmp_path)
 
 
-@pytest.mark.parametrize("octaves", [1, 3])
-def test_smoke_under_a_light(octaves: int, chromium: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("octaves", "anisotropy"), [(1, 0.0), (3, 0.0), (2, 0.5)])
+def test_smoke_under_a_light(octaves: int, anisotropy: float, chromium: Any, tmp_path: Path) -> None:
     """Light passes sixteen depth images, each with its own rounding."""
-    colour = ScatteringHarmonics(1, powers=1, waves=1, typical=2.0, octaves=octaves, share=0.4)
+    colour = ScatteringHarmonics(1, powers=1, waves=1, typical=2.0, octaves=octaves, share=0.4, anisotropy=anisotropy)
     model = random_model(TimeDensity(0, "window+motion", edge=2, gain=True), colour, count=80, seed=6)
     time = torch.tensor(0.4, dtype=torch.float64)
     near, far = torch.tensor([0.3, -0.2, 0.1]), torch.tensor([4e3, -3e3, 8e3])

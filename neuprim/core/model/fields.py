@@ -253,7 +253,12 @@ class ColourField(Field):
         """Return the closed form of the colour for one camera, under the conditions of one frame."""
 
     def shade(
-        self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
+        self,
+        geometry: Geometry,
+        density: LoweredDensity,
+        camera: AnyCamera,
+        conditions: Conditions,
+        settings: RenderSettings,
     ) -> Shading | None:
         """Return additional factors on the colours of a frame, such as shadows, or None for no factors."""
         return None

@@ -263,7 +263,9 @@ class Primitives:
         names = (type(self.density).__name__, type(self.colour).__name__)
         check_lowered_colour(colour, sizes, names[1])
         check_lowered_channels(sizes["C"][0], self.colour)
-        found = self.colour.shade(geometry, density, conditions, settings or RenderSettings()) if shaded else None
+        found = None
+        if shaded:
+            found = self.colour.shade(geometry, density, camera, conditions, settings or RenderSettings())
         shading = check_primitive_shading(found, geometry.count, model_method_label(self.colour, "shade"))
         colour = colour.shaded(shading.primitives)
         return LoweredPrimitives(geometry, density, colour, active.rows, shading.pixels, names)

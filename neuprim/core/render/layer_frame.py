@@ -67,7 +67,7 @@ class LayerFrame:
         """Mean shading factor (1: no shadow) in each pixel, (H, W), 0 where the ray hits nothing; None if unshaded."""
         geometry, density = self.lowered.geometry, self.lowered.density
         with torch.no_grad():
-            found = self.model.colour.shade(geometry, density, self.conditions, self.settings)
+            found = self.model.colour.shade(geometry, density, self.camera, self.conditions, self.settings)
         if found is None or (found.primitives is None and found.pixels is None):
             return None
         factor = torch.ones_like(self.drawn.alpha)

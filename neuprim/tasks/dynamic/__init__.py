@@ -75,7 +75,7 @@ def _build_time_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[Dens
         recording = vdb_recording_of(dataset)
         if recording is not None:
             optics = recording.capture.optics
-            more |= {"octaves": optics.octaves, "share": optics.octave_share}
+            more |= {"octaves": optics.octaves, "share": optics.octave_share, "anisotropy": optics.anisotropy}
         return density, ScatteringHarmonics(*settings, **more)
     return density, TimeHarmonics(*settings, **model["colour"])
 

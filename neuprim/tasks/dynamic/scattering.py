@@ -19,7 +19,7 @@ from neuprim.core.model.fields import Conditions, Constant, LoweredDensity, Shad
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.core.model.sh import lowest_band_colors
-from neuprim.core.render.light import check_typical_light, light_factor, shade_volume_by_light
+from neuprim.core.render.light import check_typical_light, light_factor, normalize_direction, shade_volume_by_light
 from neuprim.core.settings import RenderSettings
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 
@@ -27,22 +27,39 @@ SHINES = "shines"
 """Name of a condition, 0 or 1: whether an image includes emission. Of several images to be summed, only one does."""
 
 MOST_OCTAVES = 8
+MOST_ANISOTROPY = 0.95
 
-_Transmittance = TypeVar("_Transmittance", np.ndarray, Tensor)
+_Array = TypeVar("_Array", np.ndarray, Tensor)
 
 
-def scattered_light(transmittance: _Transmittance, octaves: int, share: float) -> _Transmittance:
-    """Return the light that a point scatters, divided by the unoccluded light: sum_{o < octaves} share^o T^(1/2^o).
+def octaves_of_light(transmittance: _Array, octaves: int, share: float) -> list[_Array]:
+    """Return the octaves of the light that a point scatters, divided by the unoccluded light: share^o T^(1/2^o).
 
     T is the transmittance to the light. The first octave is single scattering. Each further octave approximates light
     that is scattered more often: it is weaker, and extinction weakens it half as much (Wrenninge et al. 2013, Oz: The
     Great and Volumetric).
     """
-    found, arriving = transmittance, transmittance
+    found = [transmittance]
     for octave in range(1, octaves):
-        arriving = arriving**0.5
-        found = found + share**octave * arriving
+        transmittance = transmittance**0.5
+        found.append(share**octave * transmittance)
     return found
+
+
+def scattered_light(transmittance: _Array, octaves: int, share: float) -> _Array:
+    """Return the sum of :func:`octaves_of_light`: the scattered light, averaged over all view directions."""
+    first, *others = octaves_of_light(transmittance, octaves, share)
+    return sum(others, first)
+
+
+def phase_factor(cosine: _Array, anisotropy: float) -> _Array:
+    """Return 4 pi times the phase function of Henyey and Greenstein (1941): (1 - g^2) / (1 + g^2 - 2 g cosine)^(3/2).
+
+    The mean over all directions is 1. ``cosine`` is that of the angle by which light is deflected, -1 to 1;
+    g is ``anisotropy``: above 0, most light is scattered forward.
+    """
+    g = anisotropy
+    return (1 - g * g) / (1 + g * g - 2 * g * cosine) ** 1.5
 
 
 def light_smoke_by_environment(environment: Environment, count: int, facts: Mapping[str, Any]) -> Illumination:
@@ -63,28 +80,35 @@ def light_smoke_by_environment(environment: Environment, count: int, facts: Mapp
 class ScatteringHarmonics(TimeHarmonics):
     """Colour field of emission (the colour of :class:`TimeHarmonics`) plus scattered light, S max(0, a) E/typical.
 
-    a (C,) is a parameter of each primitive: albedo times the scattering fraction of the extinction times the isotropic
-    phase function 1/(4 pi). S is the :func:`scattered_light` for the model's transmittance from the primitive's centre
-    to the light, without gradient (:func:`~neuprim.core.render.light.shade_volume_by_light`). E is the condition
-    ``light_intensity``: the irradiance of the unoccluded light.
+    a (C,) is a parameter of each primitive: albedo times the scattering fraction of the extinction, divided by 4 pi. E
+    is the condition ``light_intensity``: the irradiance of the unoccluded light. S is the sum over o of the
+    :func:`octaves_of_light`, each times the :func:`phase_factor` for anisotropy/2^o. T is the model's transmittance
+    from the primitive's centre to the light, without gradient
+    (:func:`~neuprim.core.render.light.shade_volume_by_light`).
 
     Args:
         typical: irradiance of a typical training light.
-        octaves, share: arguments of :func:`scattered_light`.
+        octaves, share: arguments of :func:`octaves_of_light`.
+        anisotropy: argument of :func:`phase_factor`, -0.95 to 0.95; 0: light is scattered equally in all directions.
     """
 
-    def __init__(self, *settings: Any, typical: float = 1.0, octaves: int = 1, share: float = 0.5, **more: Any) -> None:
+    def __init__(
+        self, *settings: Any, typical: float = 1.0, octaves: int = 1, share: float = 0.5, anisotropy: float = 0.0,
+        **more: Any,
+    ) -> None:  # fmt: skip
         super().__init__(*settings, **more)
         check_typical_light(typical)
         if isinstance(octaves, bool) or not isinstance(octaves, int) or not 1 <= octaves <= MOST_OCTAVES:
             raise ValueError(f"octaves {octaves!r}; expected 1..{MOST_OCTAVES}")
         if not 0 <= share <= 1:
             raise ValueError(f"share {share!r}; expected 0..1")
-        self.typical, self.octaves, self.share = float(typical), octaves, float(share)
-        self._brightest = float(scattered_light(np.ones(()), octaves, self.share))
+        if not abs(anisotropy) <= MOST_ANISOTROPY:
+            raise ValueError(f"anisotropy {anisotropy!r}; expected {-MOST_ANISOTROPY}..{MOST_ANISOTROPY}")
+        self.typical, self.octaves, self.share, self.anisotropy = float(typical), octaves, float(share), anisotropy
 
     def settings(self) -> dict[str, Any]:
-        return {**super().settings(), "typical": self.typical, "octaves": self.octaves, "share": self.share}
+        own = {name: getattr(self, name) for name in ("typical", "octaves", "share", "anisotropy")}
+        return {**super().settings(), **own}
 
     def parameters(self) -> list[ParameterSpec]:
         C = self.channels
@@ -105,16 +129,40 @@ class ScatteringHarmonics(TimeHarmonics):
         own = super().lower(params, geometry, camera, conditions).rgb
         if SHINES in conditions:
             own = own * device.to_device_like(conditions[SHINES], own)
-        strength = self._brightest * light_factor(geometry, conditions, self.typical, falloff=False)
-        return Constant(params["scattered"].clamp_min(0.0) * strength, own)
+        strength = light_factor(geometry, conditions, self.typical, falloff=False)
+        unoccluded = self._scattered(torch.ones_like(geometry.means[:, 0]), geometry, camera, conditions)
+        return Constant(params["scattered"].clamp_min(0.0) * strength * unoccluded[:, None], own)
 
     def shade(
-        self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
+        self,
+        geometry: Geometry,
+        density: LoweredDensity,
+        camera: AnyCamera,
+        conditions: Conditions,
+        settings: RenderSettings,
     ) -> Shading:
         shading = shade_volume_by_light(geometry, density, conditions, settings)
         if self.octaves == 1 or shading.primitives is None:
             return shading
-        return Shading(scattered_light(shading.primitives, self.octaves, self.share) / self._brightest)
+        with torch.no_grad():
+            one, arriving = torch.ones_like(geometry.means[:, 0]), shading.primitives.to(geometry.means)
+            found, unoccluded = (self._scattered(t, geometry, camera, conditions) for t in (arriving, one))
+        return Shading(found / unoccluded)
+
+    def _scattered(
+        self, transmittance: Tensor, geometry: Geometry, camera: AnyCamera, conditions: Conditions
+    ) -> Tensor:
+        """Return (N,) S for the ``transmittance`` (N,) of the primitives; see the class."""
+        if not self.anisotropy:
+            return scattered_light(transmittance, self.octaves, self.share)
+        means, size = geometry.means, geometry.detached_length_scale[:, None]
+        towards = normalize_direction(device.to_device_like(conditions["light"], means) - means, size)
+        view = normalize_direction(means - device.to_device_like(camera.position, means), size)
+        cosine = (towards * view).sum(-1)
+        found = torch.zeros_like(transmittance)
+        for octave, light in enumerate(octaves_of_light(transmittance, self.octaves, self.share)):
+            found = found + light * phase_factor(cosine, self.anisotropy / 2**octave)
+        return found
 
     def script(self) -> str:
         return read_script(__package__, "scattering.js").replace("TIME_HARMONICS", super().script().strip())

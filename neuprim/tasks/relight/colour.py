@@ -105,7 +105,12 @@ class LightNetwork(ColourField):
         ]
 
     def shade(
-        self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
+        self,
+        geometry: Geometry,
+        density: LoweredDensity,
+        camera: AnyCamera,
+        conditions: Conditions,
+        settings: RenderSettings,
     ) -> Shading | None:
         return shade_by_light(self.visibility, geometry, density, conditions, settings)
 

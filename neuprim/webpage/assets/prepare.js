@@ -204,7 +204,7 @@ function preparer(page, tensors, density, colour) {
         look.factor.fill(1);
         tint.look(i, place, look);
       }
-      const light = arriving ? arriving[i] : 1, o = ROW * n, tu = (-tc * xe) / aa, tv = (-tc * ye) / aa;
+      const light = arriving ? (tint.scatter ? tint.scatter(i, arriving[i]) : arriving[i]) : 1, o = ROW * n, tu = (-tc * xe) / aa, tv = (-tc * ye) / aa;
       for (let a = 0; a < 3; a++) {
         rows[o + a] = e0[a];
         rows[o + 4 + a] = ex[a];

@@ -30,12 +30,12 @@ function preparing(post) {
       }
     }
     if (camera && maps && shadow.where === "primitive" && !visible) {
-      const source = shadow.light(conditions), { extents = 0, before = 0, scatter = arriving => arriving } = shadow;
+      const source = shadow.light(conditions), { extents = 0, before = 0 } = shadow;
       const fade = i => shadow.fade * camera.diameter + (extents && extents * engine.extentTowards(i, source));
       visible = new Float64Array(engine.scales.length);
       for (const i of settled.living) {
         const [x, y, z] = engine.scene.subarray(3 * i, 3 * i + 3);
-        visible[i] = scatter(Math.fround(arrivingAt(x, y, z, camera, maps, fade(i), before)));
+        visible[i] = Math.fround(arrivingAt(x, y, z, camera, maps, fade(i), before));
       }
     }
     const count = engine.frame(request.camera, conditions, settled, visible, rows, phases);

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,12 @@ from neuprim.core.task import SceneContext
 from neuprim.runs.measure import render_light_sum
 from neuprim.runs.open import load_run, open_run
 from neuprim.runs.run import run
-from neuprim.tasks.dynamic.scattering import ScatteringHarmonics, light_smoke_by_environment, scattered_light
+from neuprim.tasks.dynamic.scattering import (
+    ScatteringHarmonics,
+    light_smoke_by_environment,
+    phase_factor,
+    scattered_light,
+)
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.dynamic.volume.lit_medium import draw_lights
 from neuprim.tasks.dynamic.volume.volume_scene import load_volume_scene
@@ -123,7 +129,7 @@ def test_octaves_of_scattering() -> None:
     single = shaded(model, light)
     model.colour = ScatteringHarmonics(0, powers=0, waves=0, octaves=3, share=0.4)
     geometry, density = model.lower_density(frame)
-    shading = model.colour.shade(geometry, density, frame, SETTINGS)
+    shading = model.colour.shade(geometry, density, camera_at((2.0, 2.0, 1.0)), frame, SETTINGS)
     assert shading is not None and shading.primitives is not None and float(shading.primitives.max()) <= 1.0
     colour = model.colour.lower(model.of(model.colour), geometry, camera_at((2.0, 2.0, 1.0)), frame)
     assert isinstance(colour, Constant)
@@ -132,8 +138,49 @@ def test_octaves_of_scattering() -> None:
     assert torch.allclose(arriving, expected, rtol=1e-5, atol=1e-7)
 
 
-@pytest.mark.parametrize("wrong", [{"octaves": 0}, {"octaves": 9}, {"octaves": True}, {"share": 1.5}, {"share": -0.1}])
-def test_impossible_octaves_are_refused(wrong: dict[str, Any]) -> None:
+@pytest.mark.parametrize("octaves", [1, 2])
+@pytest.mark.parametrize("light", [(2.0, -1.0, 3.0), (5e3, 1e3, 0.0)])
+def test_smoke_scatters_more_light_forward(octaves: int, light: tuple[float, float, float]) -> None:
+    """Against the phase function itself, in float64, from cameras opposite to the light, beside it and in front."""
+    model, place = cloud(40), torch.tensor(light)
+    colour = ScatteringHarmonics(0, powers=0, waves=0, octaves=octaves, share=0.4, anisotropy=0.6)
+    frame = {"time": torch.tensor(0.5), "light": place, "light_intensity": torch.full((3,), 2.0)}
+    arriving, (geometry, density) = shaded(model, place).double(), model.lower_density(frame)
+    bright = []
+    for direction in (-place, torch.linalg.cross(place, torch.tensor([0.0, 0.0, 1.0])), place):
+        camera = camera_at((3.0 * direction / direction.norm()).tolist())
+        lowered = colour.lower(model.of(colour) | model.of(model.colour), geometry, camera, frame)
+        shading = colour.shade(geometry, density, camera, frame, SETTINGS).primitives
+        assert isinstance(lowered, Constant) and shading is not None and bool((shading <= 1 + 1e-6).all())
+        means = geometry.means.double()
+        cosine = (normalize(place - means, dim=1) * normalize(means - camera.position, dim=1)).sum(1)
+        expected = torch.zeros(40, dtype=torch.float64)
+        for o in range(octaves):
+            g = 0.6 / 2**o
+            phase = (1 - g * g) / (4 * math.pi * (1 + g * g - 2 * g * cosine) ** 1.5)
+            expected += 4 * math.pi * 0.4**o * arriving ** (1 / 2**o) * phase
+        found = (shading[:, None] * lowered.rgb).double()
+        assert torch.allclose(found, 2 * expected[:, None] * model.params["scattered"], rtol=1e-4, atol=1e-6)
+        bright.append(float(found.sum()))
+    assert bright[0] > 4 * bright[1] > 4 * bright[2]
+
+
+def test_the_phase_factor_has_mean_1_and_no_pole() -> None:
+    cosine = torch.linspace(-1, 1, 200_001, dtype=torch.float64)
+    for anisotropy in (-0.95, -0.3, 0.0, 0.5, 0.95):
+        factor = phase_factor(cosine, anisotropy)
+        assert float(torch.trapezoid(factor, cosine)) / 2 == pytest.approx(1.0, rel=1e-5)
+        assert float(factor.min()) > 0 and float(factor.max()) < 1e3
+        mean = float(torch.trapezoid(factor * cosine, cosine)) / 2
+        assert mean == pytest.approx(anisotropy, abs=1e-5)  # g is the mean cosine
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"octaves": 0}, {"octaves": 9}, {"octaves": True}, {"share": 1.5}, {"share": -0.1}, {"anisotropy": 0.96},
+     {"anisotropy": float("nan")}],
+)  # fmt: skip
+def test_impossible_scattering_is_refused(wrong: dict[str, Any]) -> None:
     (name,) = wrong
     with pytest.raises(ValueError, match=rf"^{name} .*; expected"):
         ScatteringHarmonics(0, **wrong)

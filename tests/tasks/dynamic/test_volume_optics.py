@@ -15,7 +15,7 @@ from neuprim.core.cameras import Camera, look_at
 from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import list_vdb_files, read_grid, vdb_scale_transform, write_vdb
 from neuprim.tasks.dynamic.volume.capture import hemisphere_capture_cameras
-from neuprim.tasks.dynamic.volume.lit_medium import build_medium, light_medium
+from neuprim.tasks.dynamic.volume.lit_medium import LitMedium, build_medium, light_medium
 from neuprim.tasks.dynamic.volume.optics import OPTICS_PRESETS, Axis, Light, Optics, black_body_rgb, black_body_xyz
 from neuprim.tasks.dynamic.volume.raymarch import Medium, light_transmittance, point_transmittance, render_medium
 from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation
@@ -90,6 +90,35 @@ def test_the_equation_of_a_look() -> None:
     middle = value(emission=3.0, kelvin=(1000.0, 2000.0), flame_range=(0.0, 0.5))
     assert middle[1:] == pytest.approx((6.0 * black_body_rgb(np.array(1500.0), 2000.0)).tolist(), rel=1e-3)
     assert value(flame_extinction=8.0)[0] == 4.0
+
+
+@pytest.mark.parametrize("octaves", [1, 2])
+def test_the_angle_to_the_light(octaves: int) -> None:
+    """Each octave of a pixel is multiplied by the phase function of its ray; light that does not scatter is not."""
+    medium = ragged(3, (6, 8, 7), 20.0)
+    medium = dataclasses.replace(medium, scattered=0.7 * medium.values[..., :1] * np.ones(3, np.float32))
+    look = Optics(albedo=(0.6, 0.6, 0.6), light=Light((-0.5, 2.0, 0.3), (3.0, 2.0, 1.0)), octaves=octaves)
+    eye = torch.tensor([1.2, -1.0, 0.7], dtype=torch.float64)
+    view = Camera(look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])), 30.0, 40.0, 14.0, 17.0, 32, 32)
+    own = render_medium(medium, view, 1)
+    single = LitMedium.of(medium, look.light, dataclasses.replace(look, octaves=1))
+    octave_images = [single.render(view, 1) - own]
+    octave_images.append(LitMedium.of(medium, look.light, look).render(view, 1) - own - octave_images[0])
+    found = LitMedium.of(medium, look.light, dataclasses.replace(look, anisotropy=0.6))
+    rays = torch.stack(
+        torch.meshgrid((torch.arange(32) - 13.5) / 30, (torch.arange(32) - 16.5) / 40, indexing="xy"), -1
+    )
+    rays = torch.cat([rays, torch.ones(32, 32, 1)], -1).double() @ view.viewmat[:3, :3]
+    towards = torch.tensor([-0.5, 2.0, 0.3], dtype=torch.float64)
+    cosine = (rays @ towards) / rays.norm(dim=-1) / towards.norm()
+    expected = own.clone()
+    for octave in range(octaves):
+        g = 0.6 / 2**octave
+        phase = (1 - g**2) / (4 * math.pi * (1 + g**2 - 2 * g * cosine) ** 1.5)
+        expected[..., :3] += (4 * math.pi * phase)[..., None].float() * octave_images[octave][..., :3]
+    assert float(expected[..., :3].max()) > 0.1
+    assert torch.allclose(found.render(view, 1), expected, rtol=1e-4, atol=1e-5)
+    assert np.allclose(found.mean.values, light_medium(medium, look.light, look).values, rtol=1e-5, atol=1e-6)
 
 
 def test_flames_light_the_smoke() -> None:

@@ -31,9 +31,9 @@ from neuprim.core.volumes.density_truth import (
     DensityGridPlacement,
     GridExtent,
 )
-from neuprim.tasks.dynamic.volume.lit_medium import build_medium, draw_lights, light_medium
+from neuprim.tasks.dynamic.volume.lit_medium import LitMedium, build_medium, draw_lights
 from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Light, Optics
-from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
+from neuprim.tasks.dynamic.volume.raymarch import Medium
 from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation, GridReader
 
 RENDERER_VERSION = 3
@@ -180,10 +180,10 @@ class Capture:
         """
         medium = self.medium(frame)
         lights = self.frame_lights(frame)
-        media = {light: light_medium(medium, light, self.optics) for light in dict.fromkeys(lights)}
+        media = {light: LitMedium.of(medium, light, self.optics) for light in dict.fromkeys(lights)}
         brightest = 0.0
         for c, (camera, light) in enumerate(zip(self.cameras, lights, strict=True)):
-            rgba = render_medium(media[light], camera, self.samples)
+            rgba = media[light].render(camera, self.samples)
             peak = float(rgba[..., :3].max().half())  # as stored: values that half floats round to 0 are no light
             if not np.isfinite(peak):
                 raise DataError(
@@ -194,7 +194,7 @@ class Capture:
             brightest = max(brightest, peak)
             write_exr(folder / f"cam_{c:02d}.exr", rgba, half=True)
         largest = np.float32(medium.values[..., 0].max(initial=0.0))
-        points = _sample_medium_points(media[lights[0]], frame.number)
+        points = _sample_medium_points(media[lights[0]].mean, frame.number)
         np.savez(folder / LAST_FILE, brightest=np.float32(brightest), largest=largest, **points)
 
 

@@ -4,16 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from scipy import ndimage
+from torch import Tensor
 
+from neuprim.core.cameras import Camera
 from neuprim.core.errors import DataError, nearest
 from neuprim.core.io.vdb import DENSE_LIMIT, Bounds, VdbGrid
-from neuprim.tasks.dynamic.scattering import scattered_light
+from neuprim.tasks.dynamic.scattering import octaves_of_light, phase_factor, scattered_light
 from neuprim.tasks.dynamic.volume.optics import Light, Optics, black_body_rgb
-from neuprim.tasks.dynamic.volume.raymarch import NOT_FINITE, Medium, light_transmittance, point_transmittance
+from neuprim.tasks.dynamic.volume.raymarch import (
+    NOT_FINITE,
+    Medium,
+    light_transmittance,
+    point_transmittance,
+    render_medium,
+)
 
 _ONE_AROUND = ((1, 1), (1, 1), (1, 1), (0, 0))  # the layer of empty voxels that Medium.padded adds
 _BLACK_BODY_STEPS = 1024  # entries of the table of black bodies; linear between them
@@ -181,16 +190,77 @@ def draw_lights(optics: Optics, count: int, *key: int) -> list[Light | None]:
 
 
 def light_medium(medium: Medium, light: Light | None, optics: Optics) -> Medium:
-    """Return the medium with scattered light of ``light``, isotropic and with shadows, added to its radiance."""
+    """Return the medium with scattered light of ``light``, with shadows, added to its radiance.
+
+    The added radiance is the mean over all view directions: it does not depend on ``optics.anisotropy``.
+    """
     if light is None or medium.empty or medium.scattered is None:
         return medium
-    values = medium.values.copy()
+    found = scattered_light(light_transmittance(medium, light.direction), optics.octaves, optics.octave_share)
+    return _add_scattered(medium, found, light, medium.values)
+
+
+def _add_scattered(medium: Medium, scattered: np.ndarray, light: Light, values: np.ndarray) -> Medium:
+    """Return a medium with ``values`` plus the light that ``medium`` scatters, (X, Y, Z) per unit of irradiance."""
+    assert medium.scattered is not None
     arriving = np.array(light.irradiance, np.float32) / np.float32(4.0 * math.pi)
-    scattered = scattered_light(light_transmittance(medium, light.direction), optics.octaves, optics.octave_share)
-    values[..., 1:] += medium.scattered * (scattered[..., None] * arriving)
-    if not np.isfinite(values).all():
+    found = values.copy()
+    found[..., 1:] += medium.scattered * (scattered[..., None] * arriving)
+    if not np.isfinite(found).all():
         raise DataError(NOT_FINITE)
-    return replace(medium, values=values)
+    return replace(medium, values=found)
+
+
+@dataclass(frozen=True, eq=False)
+class LitMedium:
+    """A medium under a light, ready to be rendered from many cameras.
+
+    Attributes:
+        medium: the medium with all radiance that does not depend on the view direction.
+        beams: one medium per octave of anisotropic scattering, whose radiance is the mean over all view directions,
+            with its anisotropy; none if scattering is isotropic.
+        direction: towards the light, on the scene's axes, of any length.
+    """
+
+    medium: Medium
+    beams: tuple[tuple[Medium, float], ...] = ()
+    direction: tuple[float, ...] = (0.0, 0.0, 1.0)
+
+    @staticmethod
+    def of(medium: Medium, light: Light | None, optics: Optics) -> LitMedium:
+        """Light a medium; raise DataError if a radiance overflows."""
+        if not optics.anisotropy or light is None or medium.empty or medium.scattered is None:
+            return LitMedium(light_medium(medium, light, optics))
+        dark = medium.values * np.array([1, 0, 0, 0], np.float32)
+        found = octaves_of_light(light_transmittance(medium, light.direction), optics.octaves, optics.octave_share)
+        beams = ((_add_scattered(medium, t, light, dark), optics.anisotropy / 2**o) for o, t in enumerate(found))
+        return LitMedium(medium, tuple(beams), light.direction)
+
+    @property
+    def mean(self) -> Medium:
+        """The medium whose radiance is the mean over all view directions."""
+        values = self.medium.values.copy()
+        for beam, _ in self.beams:
+            values[..., 1:] += beam.values[..., 1:]
+        return replace(self.medium, values=values)
+
+    def render(self, camera: Camera, samples: int) -> Tensor:
+        """Render to (H, W, 4), see :func:`~neuprim.tasks.dynamic.volume.raymarch.render_medium`.
+
+        The angle between view and light is that of the pixel's centre. It is the same along a ray, as the light is at
+        infinity.
+        """
+        image = render_medium(self.medium, camera, samples)
+        if self.beams:
+            towards = camera.viewmat[:3, :3].double().numpy() @ np.array(self.direction, np.float64)
+            x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+            y = (np.arange(camera.height)[:, None] + 0.5 - camera.cy) / camera.fy
+            length = np.linalg.norm(towards) * np.sqrt(x * x + y * y + 1)
+            cosine = torch.from_numpy((x * towards[0] + y * towards[1] + towards[2]) / length)
+            for medium, anisotropy in self.beams:
+                factor = phase_factor(cosine, anisotropy).to(image)
+                image[..., :3] += render_medium(medium, camera, samples)[..., :3] * factor[..., None]
+        return image
 
 
 def light_by_fire(medium: Medium, glow: np.ndarray, optics: Optics) -> Medium:

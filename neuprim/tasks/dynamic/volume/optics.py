@@ -11,7 +11,7 @@ import numpy as np
 
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.validation import Accepts, Range, Unbounded, field_types, validate_fields, validate_setting_names
-from neuprim.tasks.dynamic.scattering import MOST_OCTAVES
+from neuprim.tasks.dynamic.scattering import MOST_ANISOTROPY, MOST_OCTAVES
 
 Axis = Literal["y", "z"]
 """The upward axis of a sequence's files."""
@@ -82,9 +82,11 @@ class Optics:
     B is the radiance of a black body relative to the hottest one, whose largest channel is 1; K maps
     ``flame_range`` linearly to ``kelvin`` and clamps. T_light is the transmittance to the light: single scattering,
     isotropic phase function 1/4π, with shadows. With ``octaves`` above 1,
-    :func:`~neuprim.tasks.dynamic.scattering.scattered_light` replaces T_light. Extinctions are per scene unit, and a
-    scene unit is the longest side of the sequence's box; radiances are linear sRGB in one arbitrary unit. Negative, NaN
-    and infinite voxels count as 0. With ``fire_lights`` above 0, flames light the smoke, too.
+    :func:`~neuprim.tasks.dynamic.scattering.scattered_light` replaces T_light. With an ``anisotropy``, octave o is
+    multiplied by :func:`~neuprim.tasks.dynamic.scattering.phase_factor` for anisotropy/2^o. Extinctions are per scene
+    unit, and a scene unit is the longest side of the sequence's box; radiances are linear sRGB in one arbitrary unit.
+    Negative, NaN and infinite voxels count as 0. With ``fire_lights`` above 0, flames light the smoke, too, equally in
+    all directions.
 
     Attributes:
         extinction_grids: names of the grid d in order of preference; the first that a file has is used.
@@ -93,6 +95,8 @@ class Optics:
         ambient: radiance that arrives from all directions, without shadows, RGB.
         light: a light at infinity; null for none.
         octaves: 1 for single scattering; more also approximate light that is scattered several times.
+        anisotropy: where the smoke scatters most of the light: forward above 0, so that it is brightest against the
+            light, backward below 0; 0 for all directions equally. It is g of Henyey and Greenstein's phase function.
         flame_grid: name of the grid f; a file without it does not glow.
         flame_range: values of f at the two ends of ``kelvin``.
         kelvin: temperatures of the coldest and the hottest flame.
@@ -111,6 +115,7 @@ class Optics:
     ambient: RGB = (0.0, 0.0, 0.0)
     light: Light | None = None
     octaves: Annotated[int, Range(1, MOST_OCTAVES)] = 1
+    anisotropy: Annotated[float, Range(-MOST_ANISOTROPY, MOST_ANISOTROPY)] = 0.0
     flame_grid: GridMeaning = "flames"
     flame_range: FlameRange = (0.0, 1.0)
     kelvin: KelvinRange = (1000.0, 2000.0)

@@ -58,7 +58,7 @@ _LOOK = (
 def trace_medium(
     medium: Medium, light: Light, camera: Camera, samples: int, seed: int, anisotropy: float = 0.0, depth: int = _DEPTH
 ) -> Tensor:
-    """Path trace a medium under a light at infinity, with at most ``depth`` path segments: (H, W, 3) linear radiance."""
+    """Path trace a medium under a light at infinity, at most ``depth`` path segments: (H, W, 3) linear radiance."""
     import mitsuba  # only where it is needed: tables are made without it
 
     mitsuba.set_variant("scalar_rgb")

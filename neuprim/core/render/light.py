@@ -15,7 +15,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel
-from neuprim.core.compute.threads import parallel_for
+from neuprim.core.compute.threads import chunk_size, parallel_for
 from neuprim.core.model.fields import Conditions, LoweredDensity, Shading
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.render import render_slabs
@@ -60,7 +60,7 @@ def light_factor(geometry: Geometry, conditions: Conditions, typical: float, fal
 
 SIZE = 192  # pixels per side of the square depth images
 LAYERS = 4  # slabs of equal depth; more of them separate depths better and take longer
-VOLUME_SIZE, VOLUME_LAYERS = 64, 16  # for smoke, which is smooth and shadows itself at every depth
+VOLUME_SIZE, VOLUME_LAYERS = 48, 16  # for smoke, which is smooth and shadows itself at every depth
 
 FADE, EXTENTS, PIXEL_FADE = 1 / 50, 1.5, 1 / 10
 """Distances over which light fades behind a depth image of a shadow map. At a primitive, the distance is FADE scene
@@ -169,25 +169,26 @@ def light_visibility(
         near = max(1e-4 * radius, distance - 1.5 * radius)
         depths = means @ device.to_device_like(camera.viewmat[2, :3], means) + camera.viewmat[2, 3]
         low, high = torch.stack([depths.min(), depths.max()]).tolist()
-        edges = torch.linspace(low, high, layers + 1, dtype=torch.float64)
-        slabs = torch.bucketize(depths, device.to_device_like(edges[1:-1], means))
+        slabs = ((depths - low) * (layers / max(high - low, 1e-30))).ceil_().long().sub_(1).clamp_(0, layers - 1)
         own = replace(settings, depth=True, near=near, samples=1)
         opacities, distances = render_slabs(geometry, density, slabs, layers, camera, own)
     view = camera.viewmat[:3].contiguous()
+    maps = None
+    if device.on_numba(means, opacities):
+        maps = interleave_shadow_maps(opacities.numpy(), distances.numpy(), near)
 
     def visibility(points: Tensor, fade: float, more: Tensor | None = None, before: float = 0.0) -> Tensor:
         points = points.detach().double().contiguous()
         fades = torch.full_like(points[:, 0], fade * 2.0 * radius)
         if more is not None:
             fades += more
-        if not device.on_numba(points, opacities):
+        if maps is None:
             place = device.to_device_like(view, points)
             return sample_visibility(points, place, near, focal, opacities, distances, fades, before)
         found = np.empty(len(points), np.float32)
-        nearest = torch.where(opacities > 0, distances, math.inf).amin((1, 2)).numpy()  # of each slab
-        places, images = (points.numpy(), view.numpy(), near, focal), (opacities.numpy(), distances.numpy(), nearest)
-        kernel = _visibility_kernel
-        parallel_for(kernel, len(found), _CHUNK, settings.threads, *places, *images, fades.numpy(), before, found)
+        inputs = (points.numpy(), view.numpy(), near, focal, maps, fades.numpy(), before, found)
+        chunk = chunk_size(len(found), _CHUNK, settings.threads)
+        parallel_for(_visibility_kernel, len(found), chunk, settings.threads, *inputs)
         return torch.from_numpy(found)
 
     return visibility
@@ -222,10 +223,23 @@ def sample_visibility(
     return torch.where(ahead, (1.0 - alpha * s * s * (3.0 - 2.0 * s)).prod(0), 1.0).float()
 
 
+def interleave_shadow_maps(alphas: np.ndarray, depths: np.ndarray, near: float) -> np.ndarray:
+    """Return (S + 2, S + 2, 2, slabs) float32: opacity, and opacity over depth, of each pixel; 0 around the images."""
+    slabs, size, _ = alphas.shape
+    maps = np.zeros((size + 2, size + 2, 2, slabs), np.float32)
+    maps[1:-1, 1:-1, 0] = np.moveaxis(alphas, 0, -1)
+    maps[1:-1, 1:-1, 1] = maps[1:-1, 1:-1, 0] / np.maximum(np.moveaxis(depths, 0, -1), near)
+    return maps
+
+
 @exact_kernel
-def _visibility_kernel(start, stop, points, view, near, focal, alphas, depths, nearest, fades, before, found):  # type: ignore[no-untyped-def]
-    """Write the visibility of a light at points ``start:stop`` into ``found``; see :func:`sample_visibility`."""
-    size = alphas.shape[1]
+def _visibility_kernel(start, stop, points, view, near, focal, maps, fades, before, found):  # type: ignore[no-untyped-def]
+    """Write the visibility of a light at points ``start:stop`` into ``found``; see :func:`sample_visibility`.
+
+    ``maps`` is the result of :func:`interleave_shadow_maps`: LLVM vectorises the loops over slabs.
+    """
+    size, slabs = maps.shape[0] - 2, maps.shape[3]
+    passed = np.empty(slabs)
     for p in range(start, stop):
         x = view[0, 0] * points[p, 0] + view[0, 1] * points[p, 1] + view[0, 2] * points[p, 2] + view[0, 3]
         y = view[1, 0] * points[p, 0] + view[1, 1] * points[p, 1] + view[1, 2] * points[p, 2] + view[1, 3]
@@ -237,23 +251,19 @@ def _visibility_kernel(start, stop, points, view, near, focal, alphas, depths, n
         u, v = focal * x / z + 0.5 * size - 0.5, focal * y / z + 0.5 * size - 0.5
         if not (-1.0 < u < size and -1.0 < v < size):
             continue
-        i, j = int(np.floor(v)), int(np.floor(u))
-        down, right = v - i, u - j
+        i, j = int(np.floor(v)) + 1, int(np.floor(u)) + 1
+        down, right = v + 1 - i, u + 1 - j
+        a, b, c, d = maps[i, j], maps[i, j + 1], maps[i + 1, j], maps[i + 1, j + 1]
+        wa, wb, wc, wd = (1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right
+        fade = 1.0 / fades[p]
+        for k in range(slabs):
+            alpha = wa * a[0, k] + wb * b[0, k] + wc * c[0, k] + wd * d[0, k]
+            nearness = wa * a[1, k] + wb * b[1, k] + wc * c[1, k] + wd * d[1, k]
+            s = min(max((z - alpha / max(nearness, 1e-30)) * fade + before, 0.0), 1.0)
+            passed[k] = 1.0 - alpha * s * s * (3.0 - 2.0 * s)
         arrives = 1.0
-        for k in range(alphas.shape[0]):
-            if z + before * fades[p] <= nearest[k]:  # the step below is 0
-                continue
-            alpha, nearness = 0.0, 0.0
-            for di in range(2):
-                for dj in range(2):
-                    if 0 <= i + di < size and 0 <= j + dj < size and alphas[k, i + di, j + dj] > 0.0:
-                        own = np.float64(alphas[k, i + di, j + dj])
-                        weight = (down if di else 1.0 - down) * (right if dj else 1.0 - right) * own
-                        alpha += weight
-                        nearness += weight / max(np.float64(depths[k, i + di, j + dj]), near)
-            behind = z - alpha / max(nearness, 1e-30)
-            s = min(max(behind / fades[p] + before, 0.0), 1.0)
-            arrives *= 1.0 - alpha * s * s * (3.0 - 2.0 * s)
+        for k in range(slabs):
+            arrives *= passed[k]
         found[p] = arrives
 
 

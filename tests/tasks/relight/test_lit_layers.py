@@ -17,6 +17,7 @@ from neuprim.core.render.light import (
     PIXEL_FADE,
     _visibility_kernel,
     extents_towards,
+    interleave_shadow_maps,
     light_visibility,
     sample_visibility,
 )
@@ -100,10 +101,9 @@ def test_both_read_the_same(slabs: int) -> None:
     local = torch.stack([side, 0.4 * (edge[:, 2] - 0.5), torch.ones(200, dtype=torch.float64)], -1) * 3
     points = torch.cat([points, (local - view[:, 3]) @ view[:, :3]])
     found = np.full(len(points), -1.0, np.float32)
-    nearest = torch.where(alphas > 0, depths, torch.inf).amin((1, 2))
-    images = (alphas.numpy(), depths.numpy(), nearest.numpy())
+    maps = interleave_shadow_maps(alphas.numpy(), depths.numpy(), NEAR)
     fades = 0.1 + torch.rand(len(points), generator=generator, dtype=torch.float64)
-    _visibility_kernel(0, len(points), points.numpy(), view.numpy(), NEAR, FOCAL, *images, fades.numpy(), 0.0, found)
+    _visibility_kernel(0, len(points), points.numpy(), view.numpy(), NEAR, FOCAL, maps, fades.numpy(), 0.0, found)
     wanted = sample_visibility(points, view, NEAR, FOCAL, alphas, depths, fades)
     assert wanted.dtype == torch.float32 and torch.allclose(torch.from_numpy(found), wanted, rtol=0, atol=5e-7)
     assert 0.1 < float((wanted < 0.99).float().mean()) and float(wanted.min()) < 0.3

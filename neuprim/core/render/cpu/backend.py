@@ -264,16 +264,15 @@ def render_slabs(
     means = lowered.geometry.means
     request = RasterRequest.of(lowered, camera, settings, RenderStats("cpu", len(means)))
     frame = _prepare_frame(request, camera.viewmat, rasterizer_tensors(lowered), (slabs.numpy(), count))
-    shape, saved = (count, camera.height, camera.width), SavedForBackward.allocate(0)
-    T, z = np.empty(shape, np.float32), np.empty(shape, np.float32)
-    rgb, last = np.empty((*shape[1:], 1), np.float32), np.empty(shape[1:], np.int32)  # not used
-    colors, black = np.zeros((len(means), 1), np.float32), np.zeros(1, np.float32)
-    for slab in range(count):
-        starts = frame.lists.starts[slab * frame.tiles : (slab + 1) * frame.tiles + 1]
-        parallel_for(
-            composite_tiles, frame.tiles, frame.chunk, settings.threads, frame.arrays._replace(starts=starts), colors,
-            TileImage(rgb, T[slab], z[slab], last, black, True), saved.live, saved.first_lane, None,
-            EDGE_TYPES[request.edge],
-        )  # fmt: skip
+    shape, saved = (count * camera.height, camera.width), SavedForBackward.allocate(0)
+    T, z, last = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.int32)
+    image = TileImage(np.empty((*shape, 0), np.float32), T, z, last, np.zeros(0, np.float32), True)
+    tiles, threads = count * frame.tiles, settings.threads
+    chunk = max(frame.chunk, tiles // (_UNITS_PER_THREAD * resolve_threads(threads)))
+    parallel_for(
+        composite_tiles, tiles, chunk, threads, frame.arrays, np.zeros((len(means), 0), np.float32), image,
+        saved.live, saved.first_lane, None, EDGE_TYPES[request.edge],
+    )  # fmt: skip
     alpha = 1 - torch.from_numpy(T)
-    return alpha.to(means.dtype), mean_depth(torch.from_numpy(z), alpha).to(means.dtype)
+    images = alpha.to(means.dtype), mean_depth(torch.from_numpy(z), alpha).to(means.dtype)
+    return images[0].unflatten(0, (count, -1)), images[1].unflatten(0, (count, -1))

@@ -36,7 +36,7 @@ Array = np.ndarray[Any, Any]
 
 
 class TileImage(NamedTuple):
-    """Arrays that the forward kernels fill, and the (C,) background behind them."""
+    """Arrays that the forward kernels fill, and the (C,) background behind them; several images are stacked."""
 
     # (H, W, C) and (H, W)
     rgb: Array
@@ -201,7 +201,8 @@ def _store_tile(state, tx, ty, down, wide_row, image):  # type: ignore[no-untype
 def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, edge):  # type: ignore[no-untyped-def]
     """Render tiles ``start:stop``; return the number of evaluated lanes and, unless ``live`` is empty, their depths.
 
-    A lane is one pixel of a (tile, primitive) pair, its depth an optical depth.
+    A lane is one pixel of a (tile, primitive) pair, its depth an optical depth. If the frame has the tiles of several
+    images, one image after the other, ``live`` must be empty.
 
     Args:
         frame: :class:`~neuprim.core.render.cpu.tiles.FrameArrays`.
@@ -216,6 +217,7 @@ def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, ed
     with_depth, tmin = image.with_depth, frame.transmittance_min
     keep = live.shape[0] > 0
     across = (width + P.TILE - 1) // P.TILE
+    tiles = across * ((height + P.TILE - 1) // P.TILE)  # of one image
     saved_depths = _depth_array(_max_lanes(start, stop, across, frame) if keep else 0)
     depths = borrow_array(saved_depths)
     C = colors.shape[1]
@@ -232,10 +234,10 @@ def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, ed
     bounds, offset, rows_live = borrow_array(ends), borrow_array(begins), borrow_array(lives)
     evaluated = 0
     for t in range(start, stop):
-        tx, ty = (t % across) * P.TILE, (t // across) * P.TILE
+        tx, ty, above = (t % across) * P.TILE, (t % tiles // across) * P.TILE, t // tiles * height
         down, wide_row = min(P.TILE, height - ty), min(P.TILE, width - tx)
         if starts[t] == starts[t + 1]:
-            _fill_background(tx, ty, down, wide_row, image)
+            _fill_background(tx, above + ty, down, wide_row, image)
             continue
         state[:] = f(0)
         for y in range(P.TILE):
@@ -289,7 +291,7 @@ def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, ed
                         any_live += rows_live[y]
                 if any_live == f(0):
                     break
-        _store_tile(state, tx, ty, down, wide_row, image)
+        _store_tile(state, tx, above + ty, down, wide_row, image)
     for own in (lanes, pixels, weights, lives):
         release_array(own)
     release_array(wide_lanes)

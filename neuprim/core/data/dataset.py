@@ -260,6 +260,10 @@ class PointSamples:
     sigma_scale: float  # typical sigma inside matter; the loss divides errors of sigma by it
     source_scale: float = 1.0  # typical source inside matter; the loss divides errors of source by it
     components: Mapping[str, tuple[Tensor, float]] = field(default_factory=dict)  # grid -> (M,) part of sigma, scale
+    # (M, C) float32 extinction times the radiance that is scattered per irradiance of an unoccluded light; None trains
+    # this on images only
+    scattered: Tensor | None = None
+    scattered_scale: float = 1.0  # typical ``scattered`` inside matter
 
 
 class PointSupervision(ABC):

@@ -166,7 +166,7 @@ def point_loss(model: Primitives, samples: PointSamples, settings: TrainSettings
     """Return the loss of a model's extinction and source radiance against known values at points.
 
     The loss sums mean squared errors, each error divided by its scale. Weights: 1 for the extinction, a small one for
-    each extinction component, ``train.voxel_colour`` for the source radiance.
+    each extinction component, ``train.voxel_colour`` for the source radiance and for the scattered radiance.
     """
     colour = samples.source is not None and settings.voxel_colour > 0
     found = volume_values_at(model, samples.conditions, samples.points, colour, threads)
@@ -177,6 +177,10 @@ def point_loss(model: Primitives, samples: PointSamples, settings: TrainSettings
     if found.source is not None and samples.source is not None:
         light = (found.source - device.copy_to_device(samples.source, where)) * (1 / samples.source_scale)
         parts["voxel_source"] = light.detach().square().mean()
+        loss = loss + settings.voxel_colour * light.square().mean()
+    if found.scattered is not None and samples.scattered is not None:
+        light = (found.scattered - device.copy_to_device(samples.scattered, where)) * (1 / samples.scattered_scale)
+        parts["voxel_scattered"] = light.detach().square().mean()
         loss = loss + settings.voxel_colour * light.square().mean()
     for name, (value, scale) in samples.components.items():
         if name in found.components:

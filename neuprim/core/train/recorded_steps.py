@@ -116,7 +116,8 @@ class _Inputs:
         for view, pixels in self.views:
             found += [pixels.rgb, pixels.alpha, pixels.mask, *view.conditions.values()]
         if self.samples is not None:
-            found += [*self.samples.conditions.values(), self.samples.points, self.samples.sigma, self.samples.source]
+            found += [*self.samples.conditions.values(), self.samples.points, self.samples.sigma]
+            found += [self.samples.source, self.samples.scattered]
             found += [value for value, _ in self.samples.components.values()]
         return [x for x in found if x is not None]
 
@@ -128,7 +129,8 @@ class _Inputs:
             found += [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, *view.conditions]
             found += [pixels.alpha is not None, pixels.mask is not None]
         if self.samples is not None:
-            found += [self.samples.source is not None, *self.samples.conditions, *self.samples.components]
+            found += [self.samples.source is not None, self.samples.scattered is not None]
+            found += [*self.samples.conditions, *self.samples.components]
         return tuple(found)
 
 
@@ -218,7 +220,8 @@ class StepRecorder:
             values += [*view.camera.viewmat.double().reshape(-1).tolist(), *task.background.tolist()]
         values += trainer.rates(progress).values()
         if samples is not None:
-            values += [samples.sigma_scale, samples.source_scale, *(scale for _, scale in samples.components.values())]
+            values += [samples.sigma_scale, samples.source_scale, samples.scattered_scale]
+            values += [scale for _, scale in samples.components.values()]
         given, found = memory = self._memory.pop() if self._memory else self._allocate()
         given.numpy()[: len(values)] = values
         program.given.copy_(given[: len(values)], non_blocking=True)
@@ -310,13 +313,14 @@ class StepRecorder:
         if samples is not None:
             values = like_all({name: value for name, (value, _) in samples.components.items()})
             # numbers on the device take the place of floats
-            own_scales: dict[str, Any] = {"sigma_scale": given[scales], "source_scale": given[scales + 1]}
+            names = ("sigma_scale", "source_scale", "scattered_scale")
+            own_scales: dict[str, Any] = {name: given[scales + k] for k, name in enumerate(names)}
             own_scales["components"] = {
-                name: (value, given[scales + 2 + k]) for k, (name, value) in enumerate(values.items())
+                name: (value, given[scales + 3 + k]) for k, (name, value) in enumerate(values.items())
             }
             samples = replace(
                 samples, conditions=like_all(samples.conditions), points=like(samples.points),
-                sigma=like(samples.sigma), source=like(samples.source), **own_scales,
+                sigma=like(samples.sigma), source=like(samples.source), scattered=like(samples.scattered), **own_scales,
             )  # fmt: skip
         program = _Program(_Inputs(views, samples), given)
 

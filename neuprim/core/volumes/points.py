@@ -9,6 +9,7 @@ compiled code. For any other density, torch code evaluates each pair of point an
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -47,6 +48,7 @@ class PointValues(NamedTuple):
         rows: (N,) int64 rows of the primitives that are active in the frame, None for all.
         shares: contributions of the active primitives; zeros until a backward pass.
         components: name of a source grid -> (M,) part of sigma that comes from this grid.
+        scattered: (M, C) sigma times :meth:`~neuprim.core.model.fields.ColourField.scattering`; None if the source is.
     """
 
     sigma: Tensor
@@ -54,6 +56,7 @@ class PointValues(NamedTuple):
     rows: Tensor | None
     shares: PointShares
     components: dict[str, Tensor]
+    scattered: Tensor | None
 
     def request_shares(self, error: Tensor) -> PointShares:
         """Return the object that will hold each primitive's contribution to ``error`` (M,), which gets no gradient.
@@ -84,24 +87,25 @@ def volume_values_at(
     geometry, count = active.geometry, active.geometry.count
     colour_params = {spec.name: active.params[spec.name] for spec in model.colour.parameters()}
     isotropic = model.colour.isotropic(colour_params, conditions) if colour else None
-    colors = [] if isotropic is None else [isotropic]
+    scattering = None if isotropic is None else model.colour.scattering(colour_params)
     named = model.density.components(active.own)
-    columns = [*colors, *(share[:, None] for share in named.values())]
+    columns = [x for x in (isotropic, scattering) if x is not None]
+    widths = [0 if x is None else x.shape[1] for x in (isotropic, scattering)]
+    columns += [share[:, None] for share in named.values()]
     weights = torch.cat(columns, 1) if columns else geometry.means.new_zeros(count, 0)
     form = model.density.lower(active.own, geometry, conditions)
     shares = PointShares(count, geometry.means.device)
-    width = colors[0].shape[1] if colors else 0
     if compiled and isinstance(form, Cosine):
         from neuprim.core.volumes.points_warp import cosine_point_values
 
         values = cosine_point_values(geometry, form, points, weights, shares)
-        return _point_values(values, width, active.rows, shares, tuple(named))
+        return _point_values(values, widths, active.rows, shares, tuple(named))
     try:
         values = weighted_extinctions_at(active, form, points, weights, shares, threads)
     except NonFiniteError:
         model.check_finite()  # names the parameter, if it is one
         raise
-    return _point_values(values, width, active.rows, shares, tuple(named))
+    return _point_values(values, widths, active.rows, shares, tuple(named))
 
 
 def weighted_extinctions_at(
@@ -137,11 +141,16 @@ def weighted_extinctions_at(
 
 
 def _point_values(
-    values: Tensor, width: int, rows: Tensor | None, shares: PointShares, named: tuple[str, ...]
+    values: Tensor, widths: Sequence[int], rows: Tensor | None, shares: PointShares, named: tuple[str, ...]
 ) -> PointValues:
-    """Split the columns of ``values`` into extinction, source radiance (``width`` columns) and ``named`` components."""
-    components = dict(zip(named, values[:, 1 + width :].unbind(1), strict=True))
-    return PointValues(values[:, 0], values[:, 1 : 1 + width] if width else None, rows, shares, components)
+    """Split the columns of ``values``: extinction, source radiance, scattered radiance and ``named`` components.
+
+    ``widths`` are the numbers of columns of the two radiances, 0 for none.
+    """
+    sigma, source, scattered, components = values.split([1, *widths, len(named)], 1)
+    parts = dict(zip(named, components.unbind(1), strict=True))
+    light = [x if x.shape[1] else None for x in (source, scattered)]
+    return PointValues(sigma[:, 0], light[0], rows, shares, parts, light[1])
 
 
 # ---------------------------------------------------------------- torch code, for any other density

@@ -13,7 +13,7 @@ function preparing(post) {
   }
 
   function frame(request) {
-    const start = performance.now(), { conditions, rows, phases } = request, shadow = colour.shadow, words = JSON.stringify(conditions);
+    const start = performance.now() - (request.spent || 0), { conditions, rows, phases } = request, shadow = colour.shadow, words = JSON.stringify(conditions);
     if (known !== words) { // while only the camera moves, who lives and where stays
       settled = engine.settle(conditions);
       known = words;
@@ -26,7 +26,8 @@ function preparing(post) {
       if (camera) {
         const count = engine.frame(camera, conditions, settled, null, rows, phases, false);
         const ends = [...engine.within(rows, count, camera.edges), count];
-        return post({ ...request, kind: "light", camera, ends, asked: request.camera }, [rows.buffer, phases.buffer]);
+        const spent = performance.now() - start;
+        return post({ ...request, kind: "light", camera, ends, asked: request.camera, spent }, [rows.buffer, phases.buffer]);
       }
     }
     if (camera && maps && shadow.where === "primitive" && !visible) {

@@ -17,6 +17,7 @@ from neuprim.core.io.vdb import VdbGrid, vdb_scale_transform, write_vdb
 from neuprim.core.volumes.density_grid import box_lattice
 from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.volume import capture as capturing
+from neuprim.tasks.dynamic.volume import lit_medium
 from neuprim.tasks.dynamic.volume.capture_dataset import FrameVoxels, MediumVoxels, VdbFrameViews
 from neuprim.tasks.dynamic.volume.capture_density import sample_extinction
 from neuprim.tasks.dynamic.volume.lit_medium import build_medium
@@ -275,8 +276,8 @@ def test_a_second_call_renders_nothing_and_an_interrupted_one_goes_on(
 ) -> None:
     first = dataset(folder, tmp_path)
     calls: list[int] = []
-    genuine = capturing.render_medium
-    monkeypatch.setattr(capturing, "render_medium", lambda *a, **k: calls.append(1) or genuine(*a, **k))
+    genuine = lit_medium.render_medium
+    monkeypatch.setattr(lit_medium, "render_medium", lambda *a, **k: calls.append(1) or genuine(*a, **k))
     before = first.train.pixels(5).rgb
     second = dataset(folder, tmp_path)
     assert not calls and torch.equal(second.train.pixels(5).rgb, before)
@@ -302,7 +303,7 @@ def test_the_same_data_set_from_anywhere(
     address = address.replace("DIR", str(tmp_path))
     plain = dataset(hot, tmp_path)
     dataset(hot, tmp_path / "maker", cache=address)  # another machine, with a cache of its own
-    monkeypatch.setattr(capturing, "render_medium", lambda *a, **k: pytest.fail("rendered again"))
+    monkeypatch.setattr(lit_medium, "render_medium", lambda *a, **k: pytest.fail("rendered again"))
     data = dataset(hot, tmp_path / "reader", cache=address)
     assert recorded(data).folder.path.name == recorded(plain).folder.path.name, "keyed alike"
     for i in range(0, len(plain.train), 3):

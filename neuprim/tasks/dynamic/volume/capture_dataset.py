@@ -296,6 +296,7 @@ def total_extinction_of_vdb_frame(capture: Capture, store: Store, frame: VdbFram
 _NEAR, _FAR = 0.2, 0.1  # shares of the points around voxels with matter, and anywhere in the box
 _ANY_FRAME = 0.1  # share of the draws that take any frame, so that nearly empty frames are learned as well
 _MAX_OFFSET = 6  # voxels from one with matter, along each axis
+_SPHERE = np.float32(4 * math.pi)  # isotropic smoke scatters this part of the light into each direction
 _MARGIN = 0.1  # margin on each side of the sequence's box, as a share of its longest side
 
 _VOXEL_ARRAYS = {
@@ -314,8 +315,8 @@ class MediumVoxels:
 
     Attributes:
         index: (V,) int64 ascending, flat indices (i Y + j) Z + k of a grid of ``shape``.
-        values: (V, C) float32, C = 4 or 5: sigma, sigma times RGB radiance and, if flames add to sigma, the part of
-            sigma that comes from the extinction grid.
+        values: (V, C) float32: sigma, sigma times RGB radiance; if flames add to sigma, the part of sigma that comes
+            from the extinction grid; if the model lights the voxels, this part times the RGB albedo.
         scene_from_index: (4, 4) float64.
     """
 
@@ -325,27 +326,39 @@ class MediumVoxels:
     scene_from_index: np.ndarray
 
     @staticmethod
-    def of(medium: Medium) -> MediumVoxels:
-        """Return the voxels of a medium that have a non-zero value."""
+    def of(medium: Medium, lit: bool = False) -> MediumVoxels:
+        """Return the voxels of a medium that have a non-zero value; if ``lit``, with their albedo."""
         flat = medium.values.reshape(-1, 4)
         if medium.scattering is not None:
             flat = np.concatenate([flat, medium.scattering.reshape(-1, 1)], 1)
+        if lit and medium.scattered is not None:
+            flat = np.concatenate([flat, medium.scattered.reshape(-1, 3)], 1)
         index = np.flatnonzero(flat.any(1))
         x, y, z = medium.values.shape[:3]
         return MediumVoxels(
             index.astype(np.int64), np.ascontiguousarray(flat[index]), (x, y, z), medium.scene_from_index
         )
 
-    @functools.cached_property
-    def rms(self) -> tuple[float, float, float]:
-        """Root mean squares over the voxels of three values; 0 without voxels.
+    @property
+    def has_part(self) -> bool:
+        """Whether the extinction grid's part of sigma is stored, in column 4."""
+        return self.values.shape[1] in (5, 8)
 
-        The values are sigma, sigma times radiance, and the extinction grid's part of sigma (0 if it is not stored).
+    @property
+    def has_albedo(self) -> bool:
+        """Whether the last three columns are sigma times albedo."""
+        return self.values.shape[1] >= 7
+
+    @functools.cached_property
+    def rms(self) -> tuple[float, float, float, float]:
+        """Root mean squares over the voxels of four values; 0 if there are no voxels or the value is not stored.
+
+        The values are sigma, sigma times radiance, the extinction grid's part of sigma, and this part times albedo.
         """
-        if not len(self.index):
-            return 0.0, 0.0, 0.0
-        squares = np.square(self.values, dtype=np.float64).mean(0)
-        return tuple(float(np.sqrt(x)) for x in (squares[0], squares[1:4].mean(), squares[4:].sum()))  # type: ignore[return-value]
+        squares = np.square(self.values, dtype=np.float64).mean(0) if len(self.index) else np.zeros(8)
+        part = squares[4] if self.has_part else 0.0
+        scattered = squares[-3:].mean() if self.has_albedo else 0.0
+        return tuple(float(np.sqrt(x)) for x in (squares[0], squares[1:4].mean(), part, scattered))  # type: ignore[return-value]
 
     def write(self, path: Path) -> None:
         """Write the voxels to an .npz file; raises OSError."""
@@ -366,7 +379,7 @@ class MediumVoxels:
         ascending = not len(index) or (index[0] >= 0 and index[-1] < x * y * z and bool((np.diff(index) > 0).all()))
         inside = min(x, y, z) >= 0 and x * y * z < 2**62 and ascending
         finite = np.isfinite(values).all() and np.isfinite(matrix).all()
-        if len(index) != len(values) or values.shape[1] not in (4, 5) or not inside or not finite:
+        if len(index) != len(values) or values.shape[1] not in (4, 5, 7, 8) or not inside or not finite:
             raise DataError(
                 f"{path}: damaged ({len(index)} voxels of a grid of {x}x{y}x{z}; "
                 "expected ascending voxel indices in the grid, and finite values)"
@@ -427,20 +440,41 @@ class FrameVoxels(PointSupervision):
             cells, known = np.concatenate([cells, chosen]), voxels.values[rows[near:]]
         values = np.concatenate([voxels.values_at_cells(cells[: count - len(known)]), known])
         points = cells @ voxels.scene_from_index[:3, :3].T + voxels.scene_from_index[:3, 3]
-        sigma, light, part = voxels.rms
+        sigma, light, part, scattered = voxels.rms
         fallback = self.capture.optics.extinction or 1.0  # for empty frames
         # the extinction grid's part of sigma; all of sigma in a frame without flames
-        parts = torch.from_numpy(values[:, 4 if values.shape[1] > 4 else 0].copy())
+        parts = torch.from_numpy(values[:, 4 if voxels.has_part else 0].copy())
+        exposure, albedo = np.float32(self.exposure), values[:, -3:] if voxels.has_albedo else None
+        light, scattered = self._light_scales(light, scattered)
         return PointSamples(
             name=f"frame_{self.frames[t].number:04d}",
             conditions={"time": self.times[t]},
             points=torch.from_numpy(points).float(),
             sigma=torch.from_numpy(values[:, 0].copy()),
-            source=torch.from_numpy(values[:, 1:4] / np.float32(self.exposure)),
+            source=torch.from_numpy(values[:, 1:4] / exposure),
             sigma_scale=sigma or fallback,
             source_scale=(light or fallback) / self.exposure,
             components=dict.fromkeys(self.components, (parts, part or sigma or fallback)),
+            scattered=None if albedo is None else torch.from_numpy(albedo / (_SPHERE * exposure)),
+            scattered_scale=(scattered or fallback) / self.exposure,
         )
+
+    def _light_scales(self, emitted: float, scattered: float) -> tuple[float, float]:
+        """Return the scales of errors of sigma times radiance, and of that which smoke scatters per irradiance.
+
+        If the model lights the voxels, both are relative to all light, emitted and scattered: a weak part of it must
+        not count as much as the other.
+
+        Args:
+            emitted: root mean square of sigma times radiance.
+            scattered: root mean square of the extinction grid's part of sigma times albedo; 0 if it is not stored.
+        """
+        light = self.capture.optics.light
+        if not scattered or light is None:
+            return emitted, scattered
+        irradiance = sum(light.irradiance) / 3
+        total = emitted + scattered * irradiance / (4 * math.pi)
+        return total, total / irradiance
 
     def _read_voxels(self, t: int) -> MediumVoxels:
         return self.folder.retry(lambda: self._read_or_make_voxels(self.frames[t]), warn_once)
@@ -455,10 +489,11 @@ class FrameVoxels(PointSupervision):
         return medium if capture.lights > 1 else light_medium(medium, capture.frame_lights(frame)[0], capture.optics)
 
     def _read_or_make_voxels(self, frame: VdbFrame) -> MediumVoxels:
-        name = f"{self.capture.frame_folder(frame)}/voxels.npz"
+        lit = self.capture.lights > 1
+        name = f"{self.capture.frame_folder(frame)}/{'voxels_albedo' if lit else 'voxels'}.npz"
         path = self.folder.fetch_file(name, _MAX_VOXEL_BYTES)
         if not path.is_file():
-            made = MediumVoxels.of(self._supervised_medium(frame))
+            made = MediumVoxels.of(self._supervised_medium(frame), lit)
             try:
                 self.folder.write_file(name, made.write)
             except OSError as error:

@@ -236,13 +236,13 @@ def _read_vdb(folder: Path) -> None:
 
 
 def _voxels(folder: Path) -> None:
-    from neuprim.tasks.dynamic.volume.capture_dataset import MediumVoxels
+    from neuprim.tasks.dynamic.volume.capture_voxels import MediumVoxels
 
     MediumVoxels(np.array([1, 5]), np.ones((2, 4), np.float32), (2, 3, 4), np.eye(4)).write(folder / "a.npz")
 
 
 def _read_voxels(folder: Path) -> None:
-    from neuprim.tasks.dynamic.volume.capture_dataset import MediumVoxels
+    from neuprim.tasks.dynamic.volume.capture_voxels import MediumVoxels
 
     MediumVoxels.read(folder / "a.npz").values_at_cells(np.zeros((1, 3), np.int64))
 

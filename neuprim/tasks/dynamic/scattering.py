@@ -48,8 +48,11 @@ def octaves_of_light(transmittance: _Array, octaves: int, share: float) -> list[
 
 def scattered_light(transmittance: _Array, octaves: int, share: float) -> _Array:
     """Return the sum of :func:`octaves_of_light`: the scattered light, averaged over all view directions."""
-    first, *others = octaves_of_light(transmittance, octaves, share)
-    return sum(others, first)
+    parts = octaves_of_light(transmittance, octaves, share)
+    found = parts[0]
+    for part in parts[1:]:
+        found = found + part
+    return found
 
 
 def phase_factor(cosine: _Array, anisotropy: float) -> _Array:

@@ -18,6 +18,7 @@ from neuprim.core.volumes.density_grid import density_at
 from neuprim.core.volumes.points import find_point_pairs, volume_values_at
 from neuprim.core.volumes.points_cpu import sort_points_into_cells
 from neuprim.tasks.dynamic.colour import TimeHarmonics
+from neuprim.tasks.dynamic.scattering import ScatteringHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.static import SphericalHarmonics
 from tests.cosine_models import model as cosine_model
@@ -55,13 +56,17 @@ def wide(model: Primitives) -> Primitives:
     return model
 
 
-def reference(model: Primitives, conditions: Conditions, x: Tensor) -> tuple[Tensor, Tensor]:
-    """Sigma (M,) and source (M, 3) by all pairs, in float64 with autograd."""
+def reference(
+    model: Primitives, conditions: Conditions, x: Tensor, colors: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Sigma (M,) and source (M, 3) by all pairs, in float64 with autograd; with other ``colors``, if given."""
     active = model.active(conditions)
     g = active.geometry
-    harmonics = model.colour.harmonics({s.name: active.params[s.name] for s in model.colour.parameters()}, conditions)
-    assert harmonics is not None
-    colors = (harmonics[0] * 0.28209479177387814 + 0.5).clamp_min(0)
+    if colors is None:
+        own = {s.name: active.params[s.name] for s in model.colour.parameters()}
+        harmonics = model.colour.harmonics(own, conditions)
+        assert harmonics is not None
+        colors = (harmonics[0] * 0.28209479177387814 + 0.5).clamp_min(0)
     point, prim = (i.reshape(-1) for i in torch.meshgrid(torch.arange(len(x)), torch.arange(g.count), indexing="ij"))
     y = torch.einsum("pa,pab->pb", x[point] - g.means[prim], g.rotations[prim]) / g.scales[prim]
     sigma = active.sigma(prim, x[point]).clamp_min(0) * (y.square().sum(-1) < 1)
@@ -245,6 +250,22 @@ def test_a_gpu_gives_nan_for_what_is_not_finite(kernels: str) -> None:
     with torch.no_grad():
         model.params["log_scales"][7] = -800.0
     assert bool(volume_values_at(model, {}, cloud()).sigma.isnan().all())
+
+
+def test_scattered_light_is_by_itself() -> None:
+    density, colour = TimeDensity(0, "none", edge=2, gain=True), ScatteringHarmonics(0, powers=2, waves=1, typical=5.0)
+    model, x, conditions = initialised((density, colour), 60, 1.0, 0.3), cloud(), {"time": torch.tensor(0.4)}
+    found = volume_values_at(model, conditions, x)
+    emitting = {name: value for name, value in model.params.items() if name != "scattered"}
+    plain = Primitives(density, TimeHarmonics(0, powers=2, waves=1), emitting)
+    sigma, scattered = reference(model, conditions, x, model.params["scattered"].clamp_min(0) / 5)
+    assert found.scattered is not None and found.source is not None and float(scattered.detach().max()) > 0
+    for fast, slow in ((found.scattered, scattered), (found.source, reference(plain, conditions, x)[1])):
+        assert torch.allclose(fast.double(), slow, rtol=2e-6, atol=2e-6 * float(slow.detach().abs().max()))
+    exact = gradients(model, sigma, scattered)
+    for name, value in gradients(model, found.sigma, found.scattered).items():
+        bound = max(1e-5 * float(exact[name].abs().max()), 1e-12) if value.numel() else 0.0
+        assert torch.allclose(value, exact[name], rtol=1e-5, atol=bound), name
 
 
 def test_colour_is_left_out_where_it_is_not_requested_or_depends_on_direction(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,8 +18,9 @@ from neuprim.core.volumes.density_grid import box_lattice
 from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.volume import capture as capturing
 from neuprim.tasks.dynamic.volume import lit_medium
-from neuprim.tasks.dynamic.volume.capture_dataset import FrameVoxels, MediumVoxels, VdbFrameViews
+from neuprim.tasks.dynamic.volume.capture_dataset import VdbFrameViews
 from neuprim.tasks.dynamic.volume.capture_density import sample_extinction
+from neuprim.tasks.dynamic.volume.capture_voxels import FrameVoxels, MediumVoxels
 from neuprim.tasks.dynamic.volume.lit_medium import build_medium
 from neuprim.tasks.dynamic.volume.optics import optics_preset, override_optics
 from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation

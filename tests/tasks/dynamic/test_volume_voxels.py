@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import write_vdb
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import fit, prepare_training
-from neuprim.tasks.dynamic.volume.capture_dataset import FrameVoxels, MediumVoxels
+from neuprim.tasks.dynamic.volume.capture_voxels import FrameVoxels, MediumVoxels
 from neuprim.tasks.dynamic.volume.lit_medium import light_medium
 from tests.tasks.dynamic.sequences import VOXEL, dataset, empty_frame, recorded, write_blobs
 
@@ -85,6 +86,40 @@ def test_points_are_voxel_centres_with_the_files_own_values(files: Path, tmp_pat
             assert samples.sigma_scale == pytest.approx(np.sqrt((full**2).mean()), rel=1e-5)
             share = float((samples.sigma > 0).float().mean())
             assert 0.7 <= share < 0.98 and not inside.all()  # some lie beside the matter, some beyond the box
+
+
+def test_under_several_lights_points_have_emission_and_albedo(files: Path, tmp_path: Path) -> None:
+    """Errors of both are relative to all light, as a light of the look would scatter it without shadows."""
+    data = dataset(files, tmp_path, lights=3)
+    assert isinstance(data.points, FrameVoxels)
+    capture = recorded(data).capture
+    (one,) = frames_of(data.points, 1).values()
+    (samples,) = one
+    frame = next(f for f in capture.frames if samples.name == f"frame_{f.number:04d}")
+    medium, light = capture.medium(frame), capture.optics.light
+    assert medium.scattered is not None and light is not None
+    index = samples.points.double().numpy() @ medium.index_from_scene[:3, :3].T + medium.index_from_scene[:3, 3]
+    cells = np.rint(index).astype(int)
+    inside = ((cells >= 0) & (cells < medium.values.shape[:3])).all(1)
+    where = tuple(cells[inside].T)
+    assert samples.source is not None and samples.scattered is not None
+    assert np.allclose(samples.source[inside].numpy(), medium.values[where][:, 1:] / data.exposure)
+    scattered = medium.scattered[where] / (4 * math.pi * data.exposure)
+    assert np.allclose(samples.scattered[inside].numpy(), scattered, rtol=1e-5) and scattered.max() > 0
+    assert not samples.scattered[~inside].any()
+    irradiance = sum(light.irradiance) / 3
+    assert samples.source_scale == pytest.approx(irradiance * samples.scattered_scale)
+    rms = [float(np.sqrt(np.square(x[medium.values[..., 0] > 0], dtype=np.float64).mean())) for x in
+           (medium.values[..., 1:], irradiance / (4 * math.pi) * medium.scattered)]  # fmt: skip
+    assert samples.source_scale == pytest.approx(sum(rms) / data.exposure, rel=1e-4)
+    assert frames_of(supervision(files, tmp_path), 1).popitem()[1][0].scattered is None
+
+
+def test_voxels_teach_lit_smoke_its_albedo(files: Path) -> None:
+    """From voxels alone, without any image."""
+    lit = trainer(files, "scene.lights=3", "train.supervision=voxels", "train.iterations=150", "train.voxel_colour=1")
+    steps = [float(lit.train_step().parts["voxel_scattered"]) for _ in range(150)]
+    assert sum(steps[-20:]) < 0.3 * sum(steps[:20])
 
 
 def test_points_anywhere_fill_the_box_along_every_axis(files: Path, tmp_path: Path) -> None:

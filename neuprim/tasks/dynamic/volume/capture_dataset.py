@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import functools
 import math
-from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,16 +16,14 @@ from torch import Tensor
 
 from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset, DataSource, Pixels, PointCloud, View, ViewSet, camera_extent
-from neuprim.core.data.dataset import PointSamples, PointSupervision
 from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io import images
 from neuprim.core.io.json_reader import read_npz_arrays
 from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
 from neuprim.tasks.dynamic.volume.capture import Capture
-from neuprim.tasks.dynamic.volume.lit_medium import light_medium
+from neuprim.tasks.dynamic.volume.capture_voxels import FrameVoxels, RecentFrames
 from neuprim.tasks.dynamic.volume.optics import Light
-from neuprim.tasks.dynamic.volume.raymarch import Medium
 
 TRAINING_MEMORY, _TEST_MEMORY, _VOXEL_MEMORY = 6 / 11, 1 / 11, 4 / 11
 """Shares of the memory for training images, test images (read in order) and voxels."""
@@ -35,30 +32,6 @@ LIGHT_DISTANCE = 1e4
 """Distance from the scene's centre at which directional lights are placed, scene units."""
 
 _MIN_ALPHA = 1.0 / 255.0  # least alpha of a pixel that shows matter
-
-T = TypeVar("T")
-
-
-class _RecentFrames(Generic[T]):
-    """Cache of items, which ``read`` (index) provides on first use; ``size`` returns an item's bytes.
-
-    If the items exceed ``memory`` bytes, the least recently used ones are dropped.
-    """
-
-    def __init__(self, read: Callable[[int], T], size: Callable[[T], int], memory: float) -> None:
-        self._read, self._size, self._memory = read, size, memory
-        self._items: OrderedDict[int, T] = OrderedDict()
-        self._bytes = 0
-
-    def __getitem__(self, index: int) -> T:
-        if index in self._items:
-            self._items.move_to_end(index)
-            return self._items[index]
-        self._items[index] = item = self._read(index)
-        self._bytes += self._size(item)
-        while len(self._items) > 1 and self._bytes > self._memory:
-            self._bytes -= self._size(self._items.popitem(last=False)[1])
-        return item
 
 
 class VdbFrameViews(ViewSet):
@@ -84,7 +57,7 @@ class VdbFrameViews(ViewSet):
         memory: float = math.inf,
     ) -> None:
         self.capture, self.folder, self.cameras, self.exposure = capture, folder, list(cameras), exposure
-        self._images = _RecentFrames(self._decode, lambda rgba: rgba.numel() * 2, memory)
+        self._images = RecentFrames(self._decode, lambda rgba: rgba.numel() * 2, memory)
         self.frames = capture.frames[::every]
         self.times = [torch.tensor(capture.time(frame)) for frame in self.frames]
         self._lights = [capture.frame_lights(frame) for frame in self.frames]  # once, as every step needs a view
@@ -289,217 +262,3 @@ def read_vdb_frame_points(path: Path, *names: str) -> dict[str, Any]:
 def total_extinction_of_vdb_frame(capture: Capture, store: Store, frame: VdbFrame) -> float:
     """Read the total extinction of a frame from its ``points.npz``."""
     return float(read_vdb_frame_points(capture.fetch_points(store, frame), "weight")["weight"])
-
-
-# ---------------------------------------------------------------- voxels to learn from
-
-_NEAR, _FAR = 0.2, 0.1  # shares of the points around voxels with matter, and anywhere in the box
-_ANY_FRAME = 0.1  # share of the draws that take any frame, so that nearly empty frames are learned as well
-_MAX_OFFSET = 6  # voxels from one with matter, along each axis
-_SPHERE = np.float32(4 * math.pi)  # isotropic smoke scatters this part of the light into each direction
-_MARGIN = 0.1  # margin on each side of the sequence's box, as a share of its longest side
-
-_VOXEL_ARRAYS = {
-    "index": (np.int64, (None,)),
-    "values": (np.float32, (None, None)),
-    "shape": (np.int64, (3,)),
-    "scene_from_index": (np.float64, (4, 4)),
-}
-
-_MAX_VOXEL_BYTES = 4 * 2**30  # of a frame; more than the largest grid that is read
-
-
-@dataclass(frozen=True)
-class MediumVoxels:
-    """The voxels of a frame that are not empty.
-
-    Attributes:
-        index: (V,) int64 ascending, flat indices (i Y + j) Z + k of a grid of ``shape``.
-        values: (V, C) float32: sigma, sigma times RGB radiance; if flames add to sigma, the part of sigma that comes
-            from the extinction grid; if the model lights the voxels, this part times the RGB albedo.
-        scene_from_index: (4, 4) float64.
-    """
-
-    index: np.ndarray
-    values: np.ndarray
-    shape: tuple[int, int, int]
-    scene_from_index: np.ndarray
-
-    @staticmethod
-    def of(medium: Medium, lit: bool = False) -> MediumVoxels:
-        """Return the voxels of a medium that have a non-zero value; if ``lit``, with their albedo."""
-        flat = medium.values.reshape(-1, 4)
-        if medium.scattering is not None:
-            flat = np.concatenate([flat, medium.scattering.reshape(-1, 1)], 1)
-        if lit and medium.scattered is not None:
-            flat = np.concatenate([flat, medium.scattered.reshape(-1, 3)], 1)
-        index = np.flatnonzero(flat.any(1))
-        x, y, z = medium.values.shape[:3]
-        return MediumVoxels(
-            index.astype(np.int64), np.ascontiguousarray(flat[index]), (x, y, z), medium.scene_from_index
-        )
-
-    @property
-    def has_part(self) -> bool:
-        """Whether the extinction grid's part of sigma is stored, in column 4."""
-        return self.values.shape[1] in (5, 8)
-
-    @property
-    def has_albedo(self) -> bool:
-        """Whether the last three columns are sigma times albedo."""
-        return self.values.shape[1] >= 7
-
-    @functools.cached_property
-    def rms(self) -> tuple[float, float, float, float]:
-        """Root mean squares over the voxels of four values; 0 if there are no voxels or the value is not stored.
-
-        The values are sigma, sigma times radiance, the extinction grid's part of sigma, and this part times albedo.
-        """
-        squares = np.square(self.values, dtype=np.float64).mean(0) if len(self.index) else np.zeros(8)
-        part = squares[4] if self.has_part else 0.0
-        scattered = squares[-3:].mean() if self.has_albedo else 0.0
-        return tuple(float(np.sqrt(x)) for x in (squares[0], squares[1:4].mean(), part, scattered))  # type: ignore[return-value]
-
-    def write(self, path: Path) -> None:
-        """Write the voxels to an .npz file; raises OSError."""
-        arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _VOXEL_ARRAYS}
-        with open(path, "wb") as file:
-            np.savez(file, **arrays)
-
-    @staticmethod
-    def read(path: Path) -> MediumVoxels:
-        """Read voxels that :meth:`write` wrote.
-
-        Raises:
-            DataError: the file is damaged, or its arrays are not voxels of a grid.
-        """
-        found = read_npz_arrays(path, _VOXEL_ARRAYS)
-        index, values, matrix = found["index"], found["values"], found["scene_from_index"]
-        x, y, z = (int(n) for n in found["shape"])
-        ascending = not len(index) or (index[0] >= 0 and index[-1] < x * y * z and bool((np.diff(index) > 0).all()))
-        inside = min(x, y, z) >= 0 and x * y * z < 2**62 and ascending
-        finite = np.isfinite(values).all() and np.isfinite(matrix).all()
-        if len(index) != len(values) or values.shape[1] not in (4, 5, 7, 8) or not inside or not finite:
-            raise DataError(
-                f"{path}: damaged ({len(index)} voxels of a grid of {x}x{y}x{z}; "
-                "expected ascending voxel indices in the grid, and finite values)"
-            )
-        return MediumVoxels(index, values, (x, y, z), matrix)
-
-    def values_at_cells(self, cells: np.ndarray) -> np.ndarray:
-        """Return (M, C) values of the voxels with integer indices ``cells`` (M, 3); 0 for empty voxels."""
-        values = np.zeros((len(cells), self.values.shape[1]), np.float32)
-        inside = ((cells >= 0) & (cells < np.array(self.shape))).all(1)
-        if len(self.index) and inside.any():
-            flat = np.ravel_multi_index(tuple(cells[inside].T), self.shape)
-            place = np.searchsorted(self.index, flat).clip(max=len(self.index) - 1)
-            values[inside] = np.where((self.index[place] == flat)[:, None], self.values[place], np.float32(0))
-        return values
-
-
-class FrameVoxels(PointSupervision):
-    """Sampler of voxels, for training that compares the model with the extinction of the files.
-
-    The points of one draw are from one frame. The probability of a frame is proportional to its extinction; in one
-    draw of ten, it is the same for all frames. 70 % of the points are voxels with matter, 20 % lie up to six voxels
-    away from such a voxel, and 10 % anywhere in a box larger than the sequence's box.
-
-    Args:
-        folder: store of the images. Lit voxels are stored there, too, since their light takes long to compute.
-        views: training views; their frames, times and exposure are used.
-        weights: total extinction of each frame of ``views``.
-        memory: limit on the voxels in memory, bytes.
-    """
-
-    def __init__(
-        self, capture: Capture, folder: Store, views: VdbFrameViews, weights: Sequence[float], memory: float
-    ) -> None:
-        self.capture, self.folder, self.frames, self.times = capture, folder, list(views.frames), list(views.times)
-        self.exposure, self.components = views.exposure, capture.components
-        shares = torch.tensor(weights, dtype=torch.float64)
-        self.chances = (1 - _ANY_FRAME) * shares / shares.sum().clamp_min(1e-300) + _ANY_FRAME / len(self.frames)
-        self._voxels = _RecentFrames(self._read_voxels, lambda v: v.index.nbytes + v.values.nbytes, memory)
-
-    def draw(self, count: int, generator: torch.Generator) -> PointSamples:
-        t = int(torch.multinomial(self.chances, 1, generator=generator))
-        voxels = self._voxels[t]
-        near, far = round(_NEAR * count), round(_FAR * count)
-        if not len(voxels.index):
-            near, far = 0, count
-        low, high = self.capture.bounds
-        margin = _MARGIN * float((high - low).max())
-        uniform = torch.rand((far, 3), generator=generator, dtype=torch.float64).numpy()
-        places = low - margin + uniform * (high - low + 2 * margin)
-        back = np.linalg.inv(voxels.scene_from_index)
-        cells = np.rint(places @ back[:3, :3].T + back[:3, 3]).astype(np.int64)
-        known = np.zeros((0, voxels.values.shape[1]), np.float32)
-        if far < count:
-            rows = torch.randint(len(voxels.index), (count - far,), generator=generator).numpy()
-            chosen = np.stack(np.unravel_index(voxels.index[rows], voxels.shape), -1)
-            chosen[:near] += torch.randint(-_MAX_OFFSET, _MAX_OFFSET + 1, (near, 3), generator=generator).numpy()
-            cells, known = np.concatenate([cells, chosen]), voxels.values[rows[near:]]
-        values = np.concatenate([voxels.values_at_cells(cells[: count - len(known)]), known])
-        points = cells @ voxels.scene_from_index[:3, :3].T + voxels.scene_from_index[:3, 3]
-        sigma, light, part, scattered = voxels.rms
-        fallback = self.capture.optics.extinction or 1.0  # for empty frames
-        # the extinction grid's part of sigma; all of sigma in a frame without flames
-        parts = torch.from_numpy(values[:, 4 if voxels.has_part else 0].copy())
-        exposure, albedo = np.float32(self.exposure), values[:, -3:] if voxels.has_albedo else None
-        light, scattered = self._light_scales(light, scattered)
-        return PointSamples(
-            name=f"frame_{self.frames[t].number:04d}",
-            conditions={"time": self.times[t]},
-            points=torch.from_numpy(points).float(),
-            sigma=torch.from_numpy(values[:, 0].copy()),
-            source=torch.from_numpy(values[:, 1:4] / exposure),
-            sigma_scale=sigma or fallback,
-            source_scale=(light or fallback) / self.exposure,
-            components=dict.fromkeys(self.components, (parts, part or sigma or fallback)),
-            scattered=None if albedo is None else torch.from_numpy(albedo / (_SPHERE * exposure)),
-            scattered_scale=(scattered or fallback) / self.exposure,
-        )
-
-    def _light_scales(self, emitted: float, scattered: float) -> tuple[float, float]:
-        """Return the scales of errors of sigma times radiance, and of that which smoke scatters per irradiance.
-
-        If the model lights the voxels, both are relative to all light, emitted and scattered: a weak part of it must
-        not count as much as the other.
-
-        Args:
-            emitted: root mean square of sigma times radiance.
-            scattered: root mean square of the extinction grid's part of sigma times albedo; 0 if it is not stored.
-        """
-        light = self.capture.optics.light
-        if not scattered or light is None:
-            return emitted, scattered
-        irradiance = sum(light.irradiance) / 3
-        total = emitted + scattered * irradiance / (4 * math.pi)
-        return total, total / irradiance
-
-    def _read_voxels(self, t: int) -> MediumVoxels:
-        return self.folder.retry(lambda: self._read_or_make_voxels(self.frames[t]), warn_once)
-
-    def _supervised_medium(self, frame: VdbFrame) -> Medium:
-        """Return the medium whose voxels a model is compared with in training.
-
-        Its radiance includes the scattered light of a single light. If the capture has several lights, their light is
-        not included, since the model adds it.
-        """
-        capture, medium = self.capture, self.capture.medium(frame)
-        return medium if capture.lights > 1 else light_medium(medium, capture.frame_lights(frame)[0], capture.optics)
-
-    def _read_or_make_voxels(self, frame: VdbFrame) -> MediumVoxels:
-        lit = self.capture.lights > 1
-        name = f"{self.capture.frame_folder(frame)}/{'voxels_albedo' if lit else 'voxels'}.npz"
-        path = self.folder.fetch_file(name, _MAX_VOXEL_BYTES)
-        if not path.is_file():
-            made = MediumVoxels.of(self._supervised_medium(frame), lit)
-            try:
-                self.folder.write_file(name, made.write)
-            except OSError as error:
-                raise DataError(f"cannot write the voxels of {frame.path} to {path}: {error}") from error
-            return made
-        try:
-            return MediumVoxels.read(path)
-        except DataError as error:
-            raise DataError(f"{error}; delete it to read the frame again") from error

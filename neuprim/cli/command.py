@@ -150,20 +150,29 @@ def take_condition_arguments(
     """Parse ``rest``, the words that argparse does not know, as condition flags such as ``--time 0.5``.
 
     A condition is an input of an image besides the camera; the run's task defines the conditions. Other words raise
-    ConfigError, so the returned list is empty. Set ``arguments.conditions``, name -> text, and ``arguments.run``: the
-    run directory, or the run if it was loaded.
+    ConfigError, so the returned list is empty. Frame numbers (:func:`add_frame_argument`) become times. Set
+    ``arguments.conditions``, name -> text, and ``arguments.run``: the run directory, or the run if it was loaded.
     """
     arguments.conditions, arguments.run = {}, arguments.run_dir
-    if not rest:
+    numbers = getattr(arguments, "frame_numbers", None)
+    if not rest and numbers is None:
         return []
-    from neuprim.core.conditions import split_conditions
+    from neuprim.core.conditions import frames_to_times, split_conditions
     from neuprim.runs.open import load_run
 
     arguments.run = load_run(arguments.run_dir)
     arguments.conditions, unknown = split_conditions(rest, arguments.run.task.conditions)
     if unknown:
         raise refuse_argument(unknown[0], parser, arguments.run.task)
+    if numbers is not None:
+        _, arguments.conditions = frames_to_times(numbers, arguments.conditions, arguments.run.header)
     return []
+
+
+def add_frame_argument(parser: argparse.ArgumentParser) -> None:
+    """Add ``--frame NUMBERS``, which :func:`take_condition_arguments` replaces by ``--time``."""
+    text = "frames of the .vdb files by number, instead of --time: 1001-1048x2,1060"
+    parser.add_argument("--frame", dest="frame_numbers", metavar="NUMBERS", help=text)
 
 
 def refuse_argument(word: str, parser: argparse.ArgumentParser, task: TaskSpec | None = None) -> ConfigError:

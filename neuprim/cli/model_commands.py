@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from neuprim.cli.command import (
     Command,
+    add_frame_argument,
     parse_count,
     parse_decibels,
     parse_seconds,
@@ -38,6 +39,7 @@ def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
     formats = "name of the format; see the list below"
     parser.add_argument("--format", required=True, metavar="NAME", help=formats)
     parser.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR/export)")
+    add_frame_argument(parser)
     parser.add_argument("--force", action="store_true", help="replace files that exist")
     parser.add_argument("--json", action="store_true", help="print JSON")
 

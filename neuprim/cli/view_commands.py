@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from neuprim.cli.command import (
     RENDER_SETTINGS_HELP,
     Command,
+    add_frame_argument,
     parse_count,
     parse_number,
     parse_numbers,
@@ -157,6 +158,7 @@ def _add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--show", default="", metavar="NAME,...", help=shown)
     one = "show this primitive alone"
     parser.add_argument("--primitive", type=parse_whole, metavar="INDEX", help=one)
+    add_frame_argument(parser)
     parser.add_argument("--against", metavar="FILE.vdb|DIR|scene", help="ground truth to compare with")
     grid = "points along the longest side of the box (default: 128)"
     parser.add_argument("--grid", type=parse_count, default=128, metavar="N", help=grid)

@@ -103,6 +103,31 @@ def source_frames(header: Mapping[str, Any]) -> tuple[int, int] | None:
     return int(first), int(last)
 
 
+def frames_to_times(
+    text: str, conditions: Mapping[str, str], header: Mapping[str, Any]
+) -> tuple[list[int], dict[str, str]]:
+    """Return the frame numbers of ``--frame``, and the texts of ``conditions`` with the times of these frames.
+
+    Args:
+        text: the numbers, see :func:`parse_frame_numbers`.
+        conditions: condition name -> text, as the user gave them.
+        header: header of the model.
+
+    Raises:
+        ConfigError: the model has no such frames, or ``conditions`` has times, too.
+    """
+    numbers, known = parse_frame_numbers(text), source_frames(header)
+    if known is None:
+        raise ConfigError(f"--frame {text}: this model has no frame numbers; expected a model of .vdb files")
+    if "time" in conditions:
+        raise ConfigError("--frame and --time: give only one of these flags")
+    first, last = known
+    if min(numbers) < first or max(numbers) > last:
+        raise ConfigError(f"--frame {text}: the sequence has frames {first} to {last}")
+    times = ",".join(repr((number - first) / max(last - first, 1)) for number in numbers)
+    return numbers, {**conditions, "time": times}
+
+
 def frame_interval(header: Mapping[str, Any], times: Iterable[float]) -> float | None:
     """Return the time between two frames, in units of the condition "time"; None if it is unknown.
 

@@ -16,9 +16,8 @@ from neuprim.core.channels import read_stored_channels
 from neuprim.core.conditions import (
     condition_flag,
     count_condition_frames,
-    parse_frame_numbers,
+    frames_to_times,
     read_conditions,
-    source_frames,
 )
 from neuprim.core.data import View
 from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
@@ -239,16 +238,7 @@ class _RunRenderSession:
         text, conditions = self.request.frame, self.request.conditions
         if text is None:
             return [], conditions
-        numbers, known = parse_frame_numbers(text), source_frames(self.run.header)
-        if known is None:
-            raise ConfigError(f"--frame {text}: this model has no frame numbers; expected a model of .vdb files")
-        if "time" in conditions:
-            raise ConfigError("--frame and --time: give only one of these flags")
-        first, last = known
-        if min(numbers) < first or max(numbers) > last:
-            raise ConfigError(f"--frame {text}: the sequence has frames {first} to {last}")
-        times = ",".join(repr((number - first) / max(last - first, 1)) for number in numbers)
-        return numbers, {**conditions, "time": times}
+        return frames_to_times(text, conditions, self.run.header)
 
     def choose_targets(self) -> list[Path]:
         """Return the files to write, one per view or one for an animation."""

@@ -7,13 +7,14 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from neuprim.cli import main
 from neuprim.config import compose
 from neuprim.core.errors import ConfigError
-from neuprim.core.io.vdb import write_vdb
+from neuprim.core.io.vdb import read_grid, write_vdb
 from neuprim.runs.open import load_run
 from neuprim.runs.run import run
 from neuprim.tasks.dynamic import TASK, parse_dynamic_time
@@ -158,6 +159,22 @@ def test_frames_are_chosen_by_number_and_name_their_files(finished: Path, tmp_pa
         assert getattr(film, "n_frames", 1) == 4
 
 
+def test_exports_and_inspections_take_frame_numbers(finished: Path, tmp_path: Path) -> None:
+    words = ["export", str(finished), "--format", "vdb"]
+    assert main([*words, "--frame", "2-4x2", "--out", str(tmp_path / "some")]) == 0
+    assert sorted(file.name for file in (tmp_path / "some").iterdir()) == ["density_0002.vdb", "density_0004.vdb"]
+    assert main([*words, "--out", str(tmp_path / "all")]) == 0
+    for number in (2, 4):  # the same files as those of the whole sequence
+        one, same = (tmp_path / folder / f"density_{number:04d}.vdb" for folder in ("some", "all"))
+        assert np.array_equal(read_grid(one, "density").to_dense(), read_grid(same, "density").to_dense())
+    assert main([*words, "--time", "0,0.5", "--out", str(tmp_path / "between")]) == 0  # the second lies between files
+    assert sorted(file.name for file in (tmp_path / "between").iterdir()) == ["density_0000.vdb", "density_0001.vdb"]
+    picture = tmp_path / "inside.png"
+    assert main(["inspect", str(finished), "--frame", "3", "--grid", "16", "--out", str(picture)]) == 0
+    assert picture.stat().st_size > 100
+
+
+@pytest.mark.parametrize("command", [["render", "--camera", "orbit"], ["export", "--format", "vdb"], ["inspect"]])
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -169,6 +186,8 @@ def test_frames_are_chosen_by_number_and_name_their_files(finished: Path, tmp_pa
         (["--frame", "1", "--time", "0"], "--frame and --time: give only one of these flags"),
     ],
 )
-def test_impossible_frames(finished: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["render", str(finished), "--camera", "orbit", *words]) == 2
+def test_impossible_frames(
+    finished: Path, command: list[str], words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([command[0], str(finished), *command[1:], *words]) == 2
     assert message in capsys.readouterr().err

@@ -20,7 +20,7 @@ Units (metadata ``neuprim_units``):
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -29,6 +29,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuprim.core.conditions import source_frames
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport
 from neuprim.core.io.vdb import VdbGrid, VdbTiles, vdb_scale_transform, write_vdb
@@ -207,15 +208,29 @@ def _find_export_source(
 def _list_export_frames(job: ExportJob, placement: DensityGridPlacement | None) -> list[_GridFrame]:
     """List the frames to write: the frames that the user names, else all frames of the model's source .vdb files.
 
-    A model without conditions, such as the time, has one frame.
+    If all of them are at the times of different frame numbers of the source, they have these numbers, else they count
+    from 0. A model without conditions, such as the time, has one frame.
     """
     if not job.run.task.conditions:
         return [_GridFrame(0, {})]
     if job.conditions or placement is None:
         names = None if placement is None else placement.times.keys()
-        frames = [_GridFrame(i, c) for i, c in enumerate(job.frames(several=True, names=names))]
-        return [_GridFrame(f.number, f.conditions, _export_source_frame(f.conditions, placement)) for f in frames]
+        wanted = job.frames(several=True, names=names)
+        source = [_export_source_frame(conditions, placement) for conditions in wanted]
+        numbers = _export_frame_numbers(job, wanted)
+        return [_GridFrame(*frame) for frame in zip(numbers, wanted, source, strict=True)]
     return [_GridFrame(n, _export_frame_conditions(placement, i), i) for i, n in enumerate(placement.numbers)]
+
+
+def _export_frame_numbers(job: ExportJob, frames: Sequence[Conditions]) -> list[int]:
+    """Return the numbers that the source's files have, or would have, at the times of ``frames``; else 0, 1, ..."""
+    known = source_frames(job.run.header)
+    if known is not None and all("time" in conditions for conditions in frames):
+        exact = [known[0] + float(conditions["time"]) * (known[1] - known[0]) for conditions in frames]
+        numbers = [round(x) for x in exact]
+        if len(set(numbers)) == len(numbers) and all(abs(x - n) < 0.01 for x, n in zip(exact, numbers, strict=True)):
+            return numbers
+    return list(range(len(frames)))
 
 
 def _export_frame_conditions(placement: DensityGridPlacement, frame: int) -> dict[str, Tensor]:

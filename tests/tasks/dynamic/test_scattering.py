@@ -116,7 +116,14 @@ def test_lights_at_the_extremes(light: tuple[float, float, float]) -> None:
         found = shaded(model, one)
         assert bool(((found >= 0) & (found <= 1)).all())
     frame = {"time": torch.tensor(0.5), "light": place, "light_intensity": torch.ones(3)}
-    assert bool(torch.isfinite(render(model, camera_at((2.0, 2.0, 1.0)), frame, SETTINGS).rgb).all())
+    for anisotropy in (0.0, 0.95, -0.95):
+        model.colour = ScatteringHarmonics(0, powers=0, waves=0, octaves=2, anisotropy=anisotropy)
+        for eye in ((2.0, 2.0, 1.0), (0.2, 0.1, -0.1)):  # the second among the primitives, at one of the lights
+            assert bool(torch.isfinite(render(model, camera_at(eye), frame, SETTINGS).rgb).all())
+        params = {name: value.detach().requires_grad_() for name, value in model.params.items()}
+        one = Primitives(model.density, model.colour, params)
+        render(one, camera_at((2.0, 2.0, 1.0)), frame, SETTINGS).rgb.sum().backward()
+        assert all(value.grad is None or bool(torch.isfinite(value.grad).all()) for value in params.values())
 
 
 def test_octaves_of_scattering() -> None:

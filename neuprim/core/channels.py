@@ -98,7 +98,9 @@ class Channels:
             ConfigError: the task's function for display returned something else.
         """
         if image.shape[-1] != self.count:
-            raise ValueError(f"an image of shape {tuple(image.shape)} for {self.count} channels, {self.name_list}")
+            raise ValueError(
+                f"image has shape {tuple(image.shape)}; expected (H, W, {self.count}), channels {self.name_list}"
+            )
         if self.own is not None:
             return self._check_display(self.own(image), image)
         if self.count == 1:

@@ -64,7 +64,9 @@ class RenderSettings:
     def near_plane(self) -> float:
         """``near`` as a number; raises ConfigError if it is "auto"."""
         if self.near == "auto":
-            raise ConfigError("renderer.near=auto: no scene sets the distance here; expected a positive number")
+            raise ConfigError(
+                "renderer.near=auto: there is no scene to compute a distance from; expected a positive number"
+            )
         return self.near
 
 

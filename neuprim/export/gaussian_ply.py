@@ -211,9 +211,9 @@ def fit_gaussians(run: TrainedModel, conditions: Conditions, size: str) -> Gauss
     * "moments": The Gaussian has the mean and the covariance of rho = max(0, sigma), by quadrature in the ellipsoid.
       Its opacity is 1 - exp(-tau), averaged over the three axes of the ellipsoid. tau is the integral of rho along a
       line through the mean, parallel to the axis.
-    * "footprint": As "moments", but the covariance is scaled. The Gaussian's projected alpha, opacity x exp(-d^2/2)
-      at d standard deviations, then has the same integral over the image as the primitive's alpha, on average over
-      views along the three axes.
+    * "footprint": As "moments", but the covariance is scaled. The Gaussian's projected alpha is opacity x exp(-d^2/2)
+      at d standard deviations. On average over views along the three axes, its integral over the image equals that of
+      the primitive's alpha.
     * "profile": The scale of the covariance and the opacity minimise the squared difference of the two alphas over the
       images along the three axes. For each scale, the opacity preserves the integral of alpha, but is at most 0.99.
 
@@ -237,6 +237,7 @@ def fit_gaussians(run: TrainedModel, conditions: Conditions, size: str) -> Gauss
 def _fit_gaussian_chunk(
     density: Any, own: Any, still: Geometry, moved: Geometry, conditions: Conditions, size: str
 ) -> tuple[Tensor, ...]:
+    """Fit Gaussians to n primitives: return means, covariances, opacities, and whether each primitive absorbs light."""
     n, step = still.count, 2.0 / _SIDE
     ticks = (torch.arange(_SIDE, dtype=torch.float64) + 0.5) * step - 1
     ball = torch.cartesian_prod(ticks, ticks, ticks)

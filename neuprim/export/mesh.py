@@ -215,6 +215,7 @@ def _exported_vertex_colours(
 
 
 def _save_mesh(mesh: Any, colours: Tensor, space: str, path: Path, up: str, world: World) -> None:
+    """Write a mesh with vertex ``colours`` (V, 3) in colour space ``space``; ``up``: the data's upward axis."""
     import trimesh
 
     suffix, values = path.suffix.lower(), colours.clamp(0, 1)

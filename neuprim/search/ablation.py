@@ -366,7 +366,7 @@ def _check_ablation_folder(models: _AblationSet, before: TradeoffRecord | None) 
         if folder.is_dir() and any(folder.iterdir()) and not (folder / TRIALS).is_dir():
             raise ConfigError(f"--out {folder}: has other files; expected a new directory, or a directory of trainings")
     elif before.same.get("kind") != "models":
-        raise DataError(f"{folder / TRADEOFF_FILE}: is about a finished run; expected another --out DIR for trainings")
+        raise DataError(f"{folder / TRADEOFF_FILE}: is about a finished run, not trainings; expected another --out DIR")
     elif changed := before.changes(models.identity()):
         expected = "expected the same settings, or another --out DIR"
         raise ConfigError(f"{folder}: has trainings with another {' and '.join(changed)}; {expected}")

@@ -175,6 +175,7 @@ def compress_run(request: CompressRequest, progress: Progress = lambda text, fra
 def _search_quantized_model(
     request: CompressRequest, data: TrainingData, model: Primitives, table: BitTable, progress: Progress
 ) -> QuantizedModel:
+    """Fine-tune and quantize a model, by ``table`` if the request gives level or bits, else by the tolerance."""
     steps = request.steps
     if steps is None:
         steps = count_run_finetune_steps(request.seconds, Job(data.config, data.task), data.dataset, model)
@@ -234,6 +235,7 @@ class QuantizationSearch:
         return other
 
     def fit(self, share: float) -> Quantizers:
+        """Return the quantizers for the error share ``share``."""
         return fit_quantizers_to_error(self.model, self._effects, share * self._error)
 
     def find_coarsest(self, accept: Callable[[Quantizers], bool], start: float) -> tuple[Quantizers, float]:

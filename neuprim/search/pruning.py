@@ -218,6 +218,7 @@ class ModelShrinker:
         return _PruningState(result, tuple(words), bite=bite, cut=self.quality(result))
 
     def _reduce_fields(self, state: _PruningState, words: tuple[str, ...], bite: float) -> _PruningState:
+        """Return the state after reducing fields only, by ``words`` such as "colour.degree=1"."""
         model = state.model
         for word in words:
             place, _, value = word.partition("=")
@@ -226,6 +227,7 @@ class ModelShrinker:
         return _PruningState(model, (*state.words, *words), bite=bite, cut=self.quality(model), fields_only=True)
 
     def _cut_by_price(self, model: Primitives, quality: Callable[[Primitives], float], loss: float) -> Primitives:
+        """Return the model without the primitives and units of least effect per value; it loses at most ``loss`` dB."""
         if loss <= 0:
             return model
         self._sensitivity_seed += 1

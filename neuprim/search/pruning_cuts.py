@@ -134,6 +134,7 @@ def cut_to_loss(
 
 
 def _prune_below_price(model: Primitives, prices: Sensitivity, sizes: _Sizes, price: float) -> Primitives:
+    """Return a model without primitives and units whose effect on images per value is below ``price``."""
     known = prices.seen > 0  # nothing is known of primitives in no view
     kept = (~known | (prices.whole / sizes.whole >= price)).nonzero()[:, 0]
     gone = {}

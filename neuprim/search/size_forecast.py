@@ -247,6 +247,7 @@ class SizePredictor:
         )
 
     def margin_of(self, attempt: Attempt) -> float:
+        """Return by how many dB a finished training exceeds the target."""
         return self.margin({name: attempt.measured(name) for name in self.measures})
 
     def forecasts(self) -> dict[int, dict[str, Forecast]]:
@@ -257,6 +258,7 @@ class SizePredictor:
         }
 
     def _forecast(self, name: str) -> dict[int, Forecast]:
+        """Return number of primitives -> predicted measure ``name``, dB, of a full run with the current settings."""
         lengths: dict[int, dict[int, float]] = {}
         for attempt in self._relevant("size", "knob"):
             steps = int(attempt.measured("steps"))
@@ -285,6 +287,7 @@ class SizePredictor:
         return [a for a in finished if all(value in history(key) for key, value in a.words.items())]
 
     def _changes_since(self, attempt: Attempt) -> list[SettingChange]:
+        """Return the adopted changes of settings that a training was made without."""
         changes = []
         for turn in self.record.turns:
             values = self.record.history(turn.key)
@@ -293,6 +296,7 @@ class SizePredictor:
         return changes
 
     def _with_current_settings(self, name: str, attempt: Attempt) -> float:
+        """Return the measure ``name`` of a training, dB, less the losses by settings changed since."""
         loss = sum(turn.loss.get(name, 0.0) for turn in self._changes_since(attempt))
         return to_forecast_decibels(name, attempt.measured(name)) - loss
 
@@ -300,8 +304,8 @@ class SizePredictor:
         """Return a pair (primitives, margin in dB) for every number of primitives that was trained.
 
         The margin is the quality minus the target. A training of full length (a full run) has measured it; for shorter
-        trials it is a forecast. Forecasts are clamped between the margins of the next smaller and larger full runs, and
-        left out between a full run that misses the target and one that meets it.
+        trials it is a forecast. Forecasts are clamped between the margins of the next smaller and larger full runs.
+        Between a full run that misses the target and one that meets it, forecasts are left out.
         """
         margins = {
             n: self.margin({name: from_forecast_decibels(name, f.value) for name, f in values.items()})

@@ -180,8 +180,10 @@ class SizeSearch:
         )
 
     def _highest(self) -> int:
-        """Return the largest number of primitives to try. It is within the target's limits, its full run has at least
-        twice as many steps as a trial, and it is not above a number at which a trial stopped growing.
+        """Return the largest number of primitives to try.
+
+        It is within the target's limits, and not above a number at which a trial stopped growing. Its full run has at
+        least twice as many steps as a trial.
         """
         low = high = self.config.model.count
         while self.full_steps(high) > 2 * self.record.length and high < 2**24:
@@ -227,6 +229,7 @@ class SizeSearch:
             self._try_size(proposal.primitives)
 
     def _propose(self) -> SizeProposal:
+        """Return the next step of the search for the number of primitives, from the trainings so far."""
         predictor, highest = self.predictor, self._highest()
         if not self.target.quality:
             return propose_best_size(predictor.margins(), highest)

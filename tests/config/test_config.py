@@ -45,7 +45,7 @@ def test_another_strategy_starts_with_all_primitives_unless_growth_is_typed() ->
     assert grow_from() == 0.5
     assert grow_from("train.population.strategy=fixed") == grow_from("train.population={strategy: fixed}") == 1.0
     assert grow_from("train.population.strategy=relocate") == 0.5
-    with pytest.raises(ConfigError, match=r"grow_from=0\.5: fixed does not grow that way"):
+    with pytest.raises(ConfigError, match=r"grow_from=0\.5: strategy=fixed does not use this setting"):
         grow_from("train.population.strategy=fixed", "train.population.grow_from=0.5")
 
 

@@ -90,7 +90,10 @@ def canonical_model(model: Primitives) -> Primitives:
 
 
 def fit_quantizers(model: Primitives, table: BitTable) -> Quantizers:
-    """Return a quantizer for each parameter of a canonical model: ranges fit the values, bits are from ``table``."""
+    """Return a quantizer for each parameter of a canonical model: ranges fit the values, bits are from ``table``.
+
+    Positions and columns with outliers get more bits than in ``table``, unless the parameter is in ``table.exact``.
+    """
     found: Quantizers = {}
     sparse = _sparse_quantized_parameters(model)
     for spec in model.specs:
@@ -149,8 +152,7 @@ def fit_quantizers_to_error(model: Primitives, effects: Mapping[str, Tensor], er
 
 
 def _even_position_quantizer(x: Tensor, steps: Tensor) -> ColumnQuantizer:
-    """Return a quantizer of positions ``x`` (N, 3) with step lengths ``steps`` (3,), as :func:`columns_of_step` does,
-    but with the same number of bits for all axes."""
+    """Return a quantizer of positions ``x`` (N, 3) like :func:`columns_of_step`, but with equal bits for all axes."""
     own = columns_of_step(x, steps, x.double().mean(0) if len(x) else 0.0)
     bits = int(own.bits.max())
     low = own.low.double()

@@ -136,8 +136,10 @@ def _column_quantile(ordered: np.ndarray, q: float) -> np.ndarray:
 
 
 def relative_quantizer_error(x: Tensor, columns: ColumnQuantizer) -> Tensor:
-    """Return (C,) RMS quantization errors of the columns of x (N, C), each divided by the error of as many even steps
-    from -1 to 1 standard deviation."""
+    """Return (C,) RMS quantization errors of the columns of x (N, C), each divided by a usual error.
+
+    The usual error is that of as many even steps from -1 to 1 standard deviation.
+    """
     y = x.detach().double()
     error = (columns.values(columns.codes(x)).double() - y).square().mean(0).sqrt()
     usual = (y - y.mean(0)).square().mean(0).sqrt() * 2 / columns.last / 12**0.5
@@ -202,6 +204,7 @@ class RotationQuantizer:
         return self
 
     def _left(self, u: Tensor) -> Tensor:
+        """Return (N,) 2 h^2 times the square of the largest component, from the integers u (N, 3) of the others."""
         return 2 * self.half * self.half - u.square().sum(1)
 
     @staticmethod

@@ -96,8 +96,10 @@ def pack_sparse_columns(
     mask_of: Sequence[int],
     masks: Sequence[np.ndarray],
 ) -> CompressedSection:
-    """Return a section of codes (N, C) that stores in column i only the primitives in mask number ``mask_of[i]``,
-    counted from 1; 0: all primitives."""
+    """Return a section of codes (N, C) in which columns store only some of the primitives.
+
+    Column i stores those in mask number ``mask_of[i]``, counted from 1, or all primitives if the number is 0.
+    """
     own = [codes[:, i] if of == 0 else codes[masks[of - 1], i] for i, of in enumerate(mask_of)]
     planes = [plane for column, b in zip(own, scheme.bits.tolist(), strict=True) for plane in _byte_planes(column, b)]
     return CompressedSection(
@@ -209,6 +211,7 @@ def _column_records(section: CompressedSection) -> ColumnQuantizer:
 
 
 def _position_cells(planes: _PlaneReader, count: int, bits: int) -> np.ndarray:
+    """Read (count, 3) int64 codes of positions, which are stored as differences of Z-curve keys."""
     keys = np.cumsum(planes.codes(count, 3 * bits, (1 << 3 * bits) - 1), dtype=np.int64)
     if len(keys) and (keys.min() < 0 or keys.max() >= 1 << 3 * bits):  # no step is large enough to skip both ranges
         raise CorruptSection(f"a position code does not fit {3 * bits} bits")

@@ -15,7 +15,7 @@ class GraphRecorder:
 
     A function's tensors must stay at the same addresses, which its graph uses again. The first function runs once
     without being recorded, which loads its kernels. If one of its operations waits for the device, which a graph cannot
-    do, nothing is ever recorded.
+    do, it stops there and ``failed`` becomes true. The caller must then stop using the recorder.
 
     Args:
         where: device of the functions.

@@ -1,11 +1,11 @@
 """Compile the CPU kernels with numba: compiler flags, and the cache folder of the compiled code.
 
-numba's cache notices edits of a kernel's own file, but not of other files whose functions or constants were compiled
-into the kernel; and site-packages may be read-only. So compiled code is stored in the user's cache folder, under a hash
-of every source that can be part of it (:func:`kernel_sources`). ``NUMBA_CACHE_DIR``, if set, replaces that folder.
-Anyone who can write into or replace the folder controls what this user's processes execute. So neuprim uses the folder
-only if this user owns it and nobody else can change it; otherwise compiled code goes into a temporary folder of this
-process.
+numba's cache notices edits of a kernel's own file. It misses edits of other files whose functions or constants were
+compiled into the kernel. Besides, site-packages may be read-only. So compiled code is stored in the user's cache
+folder, under a hash of every source that can be part of it (:func:`kernel_sources`). ``NUMBA_CACHE_DIR``, if set,
+replaces that folder. Anyone who can write into or replace the folder controls what this user's processes execute. So
+neuprim uses the folder only if this user owns it and nobody else can change it. Otherwise compiled code goes into a
+temporary folder of this process.
 """
 
 from __future__ import annotations
@@ -119,6 +119,8 @@ class KernelLocator(getattr(caching, "UserProvidedCacheLocator", object)):  # ty
 
 
 def _jit(**options: Any) -> Callable[[Any], Any]:
+    """Return a decorator like numba's ``njit(**options)`` that stores compiled code in neuprim's cache folder."""
+
     def decorate(function: Any) -> Any:
         config: Any = numba.config
         previous = config.CACHE_DIR, getattr(config, "CACHE_LOCATOR_CLASSES", "")

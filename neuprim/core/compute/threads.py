@@ -1,4 +1,4 @@
-"""Run kernels that release the GIL over a range in parallel; run autograd operations alone where no gradient is needed.
+"""Run kernels that release the GIL in parallel over a range, and autograd operations without autograd where possible.
 
 Each chunk of a range writes its own output, so results do not depend on the number of threads.
 """

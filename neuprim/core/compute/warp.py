@@ -145,7 +145,11 @@ def _device_stream_of_torch(device: torch.device) -> Any:
 def launch_kernel(
     kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], device: torch.device, block: int = BLOCK
 ) -> None:
-    """Run a kernel with ``dim`` threads per axis on torch's current stream; do nothing if a ``dim`` is 0."""
+    """Run a kernel with ``dim`` threads per axis on torch's current stream; do nothing if a ``dim`` is 0.
+
+    ``inputs`` are the kernel's arguments: numbers, Warp vectors, results of :func:`array`, or None for an absent array.
+    ``block`` is the number of threads per block.
+    """
     if not wp.config.enable_cpu_blocks:
         raise RuntimeError("Warp runs blocks on the CPU as single threads: wp.config.enable_cpu_blocks was turned off")
     dims = (dim,) if isinstance(dim, int) else tuple(dim)

@@ -194,8 +194,8 @@ class Dataset:
 
     def __init_subclass__(cls) -> None:
         raise TypeError(
-            f"class {cls.__name__}(Dataset): a data set is made by calling neuprim.core.data.Dataset(name=..., "
-            "train=..., test=..., ...); metrics, films and headers are the task's"
+            f"class {cls.__name__}(Dataset): Dataset cannot be subclassed. Call neuprim.core.data.Dataset(name=..., "
+            "train=..., test=..., ...); the TaskSpec defines metrics, films and headers"
         )
 
     def initial_points(self, count: int, generator: torch.Generator) -> PointCloud:
@@ -286,7 +286,7 @@ def hold_out_views(dataset: Dataset, every: int) -> Dataset:
     count = len(dataset.train)
     if every < 2 or count < 2:
         found = f"cannot hold out one in {every} of {count} training views"
-        raise ConfigError(f"{dataset.name}: {found}; expected at least 2 views, and one in 2 or more")
+        raise ConfigError(f"{dataset.name}: {found}; expected at least 2 training views, and one in 2 or more")
     test = [i for i in range(count) if i % every == i // every % every]
     train = [i for i in range(count) if i % every != i // every % every]
     return replace(dataset, train=ViewSubset(dataset.train, train), test=ViewSubset(dataset.train, test))

@@ -44,6 +44,7 @@ def _blur_moments_down(moments, x, y, at, pitch, count):  # type: ignore[no-unty
 
 @inline
 def _blur_across(out, row, channels, count):  # type: ignore[no-untyped-def]
+    """Fill ``out`` with the horizontal half of the Gaussian blur of ``row``; a pixel has ``channels`` values."""
     for j in range(count):
         s = 0.0
         for k in range(SSIM_WINDOW):
@@ -53,6 +54,7 @@ def _blur_across(out, row, channels, count):  # type: ignore[no-untyped-def]
 
 @inline
 def _sum_ssim_of_moments(s, count, c1, c2):  # type: ignore[no-untyped-def]
+    """Return the sum of SSIM over ``count`` windows, from their means ``s`` (5, count) of x, y, x^2, y^2 and xy."""
     total = 0.0
     for j in range(count):
         a, b = s[0, j], s[1, j]
@@ -84,8 +86,8 @@ def _sum_ssim_of_rows(start, stop, x, y, height, channels, c1, c2):  # type: ign
 def mean_ssim(first: Tensor, second: Tensor, peak: float) -> float:
     """Return the mean SSIM over channels and over the positions where an 11 x 11 window lies inside the images.
 
-    With window means E: SSIM = (2 E[x]E[y] + c1) (2 cov + c2) / ((E[x]^2 + E[y]^2 + c1) (var x + var y + c2)), where
-    c1 = (0.01 peak)^2, c2 = (0.03 peak)^2.
+    With window means E: SSIM = (2 E[x]E[y] + c1) (2 cov + c2) / ((E[x]^2 + E[y]^2 + c1) (var x + var y + c2)). With the
+    largest possible value ``peak``, c1 = (0.01 peak)^2 and c2 = (0.03 peak)^2.
 
     Args:
         first, second: (H, W, C) float32 or float64, of at least 11 x 11 pixels.

@@ -79,6 +79,7 @@ def _basis_gradient(x, y, z, degree, g, out):  # type: ignore[no-untyped-def]
 
 @exact_kernel
 def _harmonic_colors(start, stop, means, dc, rest, origin, degree, color):  # type: ignore[no-untyped-def]
+    """Fill ``color`` (N, C) of primitives ``start:stop``; see :func:`~neuprim.core.model.sh.sh_colors`."""
     bands = (degree + 1) * (degree + 1) - 1
     C = dc.shape[1]
     Y = np.empty(15)
@@ -171,10 +172,10 @@ def _unit_or_zero(x, y, z):  # type: ignore[no-untyped-def]
 
 @strict
 def lobe_weight(nearness, log_sharpness):  # type: ignore[no-untyped-def]
-    """Return the weight exp(s ``nearness``) of a spherical Gaussian lobe, ``nearness`` clamped to at most 0, and s.
+    """Return (exp(s n), n, s): the weight of a spherical Gaussian lobe, ``nearness`` clamped to at most 0, and s.
 
-    ``nearness`` is the cosine between lobe axis and view direction, minus 1. The sharpness s is exp(``log_sharpness``),
-    with the logarithm clamped to -20..20. NaN stays NaN.
+    ``nearness`` is the cosine between the lobe's axis and a direction, minus 1. The sharpness s is
+    exp(``log_sharpness``), with the logarithm clamped to -20..20. NaN stays NaN.
     """
     if log_sharpness > LOG_LIMIT:
         log_sharpness = LOG_LIMIT
@@ -188,6 +189,7 @@ def lobe_weight(nearness, log_sharpness):  # type: ignore[no-untyped-def]
 
 @exact_kernel
 def _lobe_colors(start, stop, means, dc, amplitude, axis, log_sharpness, origin, color):  # type: ignore[no-untyped-def]
+    """Fill ``color`` (N, C) of primitives ``start:stop``; see :func:`~neuprim.core.model.lobes.lobe_colors`."""
     lobes, channels = amplitude.shape[1], amplitude.shape[2]
     weights = np.empty(lobes)
     for i in range(start, stop):

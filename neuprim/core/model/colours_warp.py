@@ -21,6 +21,7 @@ _vec15 = wp.types.vector(length=15, dtype=wp.float64)
 
 @functools.cache
 def _harmonic_functions(degree: int) -> tuple[Any, Any]:
+    """Return Warp functions for harmonics up to ``degree``: their values, and their gradient by the direction."""
     a0, a1, a2, a3, a4 = (d(c) for c in C2)
     b0, b1, b2, b3, b4, b5, b6 = (d(c) for c in C3)
     two, three, four, six, eight = d(2.0), d(3.0), d(4.0), d(6.0), d(8.0)
@@ -83,6 +84,7 @@ def _harmonic_functions(degree: int) -> tuple[Any, Any]:
 
 @functools.cache
 def _harmonic_kernels(degree: int) -> tuple[Any, Any]:
+    """Return the forward and the backward kernel of :func:`fused_harmonic_colors`, one thread per primitive."""
     basis, basis_gradient = _harmonic_functions(degree)
     bands = (degree + 1) * (degree + 1) - 1
 
@@ -189,6 +191,7 @@ def _one_over(v: wp.vec3d):
 
 @wp.func
 def lobe_sharpness(log_sharpness: float):
+    """Return exp(``log_sharpness``), float64, with the logarithm clamped to +-LOG_LIMIT."""
     value = d(log_sharpness)
     if value > _LIMIT:
         value = _LIMIT
@@ -199,6 +202,7 @@ def lobe_sharpness(log_sharpness: float):
 
 @wp.func
 def lobe_nearness(cosine: wp.float64):
+    """Return ``cosine`` - 1, at most 0: the exponent of a lobe divided by its sharpness."""
     if cosine > d(1.0):
         return d(0.0)
     return cosine - d(1.0)
@@ -210,6 +214,7 @@ def _lobe_forward(
     axis: wp.array2d(dtype=wp.vec3), log_sharpness: wp.array2d(dtype=float), origin: wp.array(dtype=wp.float64),
     color: wp.array2d(dtype=float),
 ):  # fmt: skip
+    """Compute the colours of :func:`~neuprim.core.model.lobes.lobe_colors`, one thread per primitive."""
     i = wp.tid()
     offset = wp.vec3d(means[i]) - wp.vec3d(origin[0], origin[1], origin[2])
     direction = _one_over(offset) * offset
@@ -234,6 +239,7 @@ def _lobe_backward(
     grad: wp.array2d(dtype=float), g_means: wp.array(dtype=wp.vec3), g_dc: wp.array2d(dtype=float),
     g_amplitude: wp.array3d(dtype=float), g_axis: wp.array2d(dtype=wp.vec3), g_log_sharpness: wp.array2d(dtype=float),
 ):  # fmt: skip
+    """Compute the gradients of :func:`_lobe_forward`, one thread per primitive; ``color`` is its result."""
     i = wp.tid()
     offset = wp.vec3d(means[i]) - wp.vec3d(origin[0], origin[1], origin[2])
     near = _one_over(offset)

@@ -56,7 +56,7 @@ DENSITY_TRADE: dict[str, tuple[int, ...]] = {"model.neurons": (0, 2, 4, 8), "mod
 
 
 class CosineDensity(DensityField):
-    """Density field of the neural primitive: K cosine neurons and an offset (docs/mathematics.md, "Density").
+    """Density field of the neural primitive: K cosine neurons and an offset (docs/mathematics.md, "One primitive").
 
     The field lowers to :class:`~neuprim.core.model.fields.Cosine`. Each primitive has 5K + 1 parameters, plus one with
     ``gain``. ``init.mode`` "opaque" (default) starts every primitive at central opacity ``init.alpha``. "paper" draws
@@ -169,6 +169,7 @@ _FAINT, _SOLID = 0.02, 0.98
 
 
 def _initial_density_offset(ctx: InitContext, amplitude: float, norm: float) -> Tensor:
+    """Return (N, 1) initial offsets b2 for ``init.mode`` and ``init.alpha``; ``norm`` is the N_p of the edge."""
     mode, alpha = ctx.choice("mode", "opaque", "paper"), ctx.number("alpha", 0.8, 0, 1)
     opaque = -math.log1p(-alpha) / norm  # a central chord of a sphere has optical depth N_p b2
     if mode == "paper" and amplitude:
@@ -212,10 +213,10 @@ def split_cosine(
 ) -> dict[str, Tensor]:
     """Return the parameters of children of split primitives, which continue the function f of their parents.
 
-    W1' = r W1, b1' = b1 + W1 (mu'-mu)/m, (w2, b2)' = c (w2, b2), r = m'/m: primes mark the child, mu is the centre, m
-    the longest semi-axis. With a hard edge, c = r, and sigma does not change. With a soft edge, sigma also fades inside
-    a child. Then c = r V/(2 V'), V the product of the semi-axes, so that both children together have the weight
-    (1 - |y|^2)^p of their parent. Float64 keeps the change of f to the final rounding.
+    W1' = r W1, b1' = b1 + W1 (mu'-mu)/m and (w2, b2)' = c (w2, b2), with r = m'/m. Primes mark the child, mu is the
+    centre, m the longest semi-axis. With a hard edge, c = r, and sigma does not change inside a child. With a soft
+    edge, sigma also fades inside a child. Then c = r V/(2 V'), V the product of the semi-axes. Thus both children
+    together have the integral of (1 - |y|^2)^p/m of their parent. Float64 keeps the change of f to the final rounding.
     """
     r, c = split_density_scale(old, new), split_density_scale(old, new, edge)
     shift = (new.means.double() - old.means.double()) / old.length_scale.double()[:, None]

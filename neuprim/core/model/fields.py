@@ -142,7 +142,7 @@ class Field(ABC):
         primitives change.
         """
         raise NotImplementedError(
-            f"{type(self).__name__} names {name} in reductions() and does not know how to reduce it"
+            f"{type(self).__name__}: reductions() lists {name!r}, but the class has no method reduce(); define it"
         )
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:

@@ -174,7 +174,8 @@ def render_slabs(
 ) -> tuple[Tensor, Tensor]:
     """Render each slab (a group of primitives) alone; return (S, H, W) opacities and mean depths, without gradients.
 
-    S is the number of slabs that have primitives. Slabs without primitives are left out; the others keep their order.
+    S is at most ``count``: a backend may leave out slabs without primitives, whose images are 0. The others keep their
+    order.
 
     Args:
         slabs: (N,) index of the slab of each primitive, 0 to ``count`` - 1, on the primitives' device.

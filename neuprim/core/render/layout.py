@@ -12,7 +12,7 @@ import numpy as np
 
 from neuprim.core.model.edge import EDGES
 
-# ---- One primitive, as a pixel kernel sees it (method: "float64 preparation, float32 pixels").
+# ---- One primitive, as a pixel kernel sees it.
 # The ray of pixel offset (du, dv) from the anchor pixel (UX, UY) is, in whitened space with t in units of m,
 #   x(t) = (XA + TC G) + t e,  G = du EX + dv EY,  e = E0 + G.
 # Its origin is slid along the ray by s = du TU + dv TV, to where x is nearly orthogonal to e. The closest approach is

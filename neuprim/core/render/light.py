@@ -136,12 +136,12 @@ def light_visibility(
     The primitives are sorted into ``layers`` slabs by depth from the light. Each slab is rendered alone, as an image of
     ``size`` x ``size`` pixels with opacity A_k and mean depth d_k. The light's transmittance at a point x of depth z is
 
-        V(x) = prod_k (1 - A_k s((z - d_k)/fade)),      s a smooth step from 0 at 0 to 1 at 1,
+        V(x) = prod_k (1 - A_k s((z - d_k)/fade + before)),      s a smooth step from 0 at 0 to 1 at 1.
 
-    exactly 1 where nothing lies in front, and 1 - A behind an object of opacity A. A single slab, an ordinary shadow
-    map, has one mean depth per pixel: half way between a translucent object and the floor below it. Inverse depths,
-    weighted by opacity, are interpolated bilinearly. This is exact on planes, so that a lit floor does not shadow
-    itself at grazing light. V carries no gradient.
+    With ``before`` = 0, V is exactly 1 where nothing lies in front, and 1 - A well behind an object of opacity A. A
+    single slab would be an ordinary shadow map. Its one depth per pixel is a mean, between a translucent object and the
+    floor below it. Inverse depths, weighted by opacity, are interpolated bilinearly. This is exact on planes, so that a
+    lit floor does not shadow itself at grazing light. V carries no gradient.
 
     The light's camera looks at the middle of all centres and sees all of them. A light among the primitives also looks
     at that middle; points behind the light count as lit. The depth images are rendered with the backend and threads of
@@ -207,7 +207,8 @@ def sample_visibility(
     """Return the (M,) float32 visibility of a light at ``points`` (M, 3) float64; the torch version, for GPUs.
 
     ``alphas`` and ``depths`` (slabs, S, S) are the images of the shadow maps, ``view`` the (3, 4) matrix from scene to
-    light, and ``fades`` (M,) the distances over which light fades behind a slab.
+    light. Points with a depth of at most ``near`` are lit; ``focal`` is in pixels. ``fades`` (M,) are the distances
+    over which light fades at a slab, of which the fraction ``before`` lies before its mean depth.
     """
     nearness = torch.where(alphas > 0, alphas.double() / depths.double().clamp_min(near), 0.0)
     images = torch.stack([alphas.double(), nearness], 1)  # (slabs, 2, S, S)

@@ -74,8 +74,8 @@ class DistributedTrainer(Trainer):
         super().__init__(model, dataset, loss, settings, renderer, seed)
         if self.settings.supervision == "voxels":
             raise ConfigError(
-                "train.supervision=voxels: ranks share views, which training on voxels does not use; "
-                f"expected 1 process instead of {group.size}"
+                "train.supervision=voxels: several processes divide the views of a step, but this training uses no "
+                f"views; expected 1 process, found {group.size}"
             )
         self.group, self.rank, self.ranks = group, group.rank, group.size
         self.recorder = None  # ranks exchange gradients in every step
@@ -125,6 +125,7 @@ class DistributedTrainer(Trainer):
         return self._stopping
 
     def _draw_views(self) -> list[ViewTask]:
+        """Draw the views of all ranks for one step; return those of this rank."""
         drawn = [self._draw_view() for _ in range(self.settings.views_per_step * self.ranks)]
         own = drawn[self.rank :: self.ranks]
         after = int(self.order[self.rank]) if len(self.order) > self.rank else None
@@ -136,6 +137,7 @@ class DistributedTrainer(Trainer):
         return [ViewTask(*view, then) for view, then in zip(own, upcoming, strict=True)]
 
     def _exchange_gradients(self, contributions: Contributions) -> Contributions:
+        """Add the gradients of one view of every rank to the sum; return ``contributions`` unchanged."""
         assert self._sums is not None
         present = self._sums.add(self.model.params, contributions)
         self._present = [before or now for before, now in zip(self._present, present, strict=True)]
@@ -144,6 +146,7 @@ class DistributedTrainer(Trainer):
     def _combine_views(
         self, results: list[ViewResult], each: list[Contributions], start: float
     ) -> tuple[list[ViewResult], Contributions]:
+        """Return all ranks' view results, in order, and summed contributions; set ``.grad`` to the summed gradients."""
         assert self._sums is not None
         self._agreed_at = time.perf_counter()
         elapsed = self.elapsed + self._after + self._agreed_at - start
@@ -168,6 +171,7 @@ class DistributedTrainer(Trainer):
 
 
 def _pad_gradient_exchange(numbers: int) -> int:
+    """Return ``numbers``, a count of float32 numbers, rounded up to a multiple of 16."""
     return -(-numbers // _ALIGNMENT) * _ALIGNMENT
 
 

@@ -102,7 +102,8 @@ def _add_initial_surroundings(
     if cloud.conditions:
         named = ", ".join(cloud.conditions)
         raise ConfigError(
-            f"model.init.surroundings={share!r}: matter of {dataset.name} depends on {named}; expected a scene at rest"
+            f"model.init.surroundings={share!r}: {dataset.name} changes with {named}; "
+            "expected a static scene, or model.init.surroundings=0"
         )
     own = draw_points(cloud, min(len(cloud.means), round((1.0 - share) * settings.count)), generator)
     more = surrounding_points(dataset.train, own, settings.count - len(own.means), generator)

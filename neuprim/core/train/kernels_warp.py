@@ -87,6 +87,8 @@ _C1, _C2 = wp.constant(0.01**2), wp.constant(0.03**2)
 
 @functools.cache
 def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
+    """Return the kernels of :func:`ssim_loss_with_gradient` in launch order, one thread per number of the output."""
+
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def along_rows(
         a: wp.array3d(dtype=float), b: wp.array3d(dtype=float), window: _Window, out: wp.array3d(dtype=_vec5)

@@ -1,7 +1,7 @@
 """Population control: strategies that add, move and remove primitives (ellipsoids with a density) during a training.
 
-A split replaces a primitive by two smaller ones, its children. Splits are exact: a child has its parent's density and
-colour as functions of space.
+A split replaces a primitive by two smaller ones, its children. With a hard edge, a child has exactly its parent's
+density inside its own ellipsoid. With a soft edge, the density changes slightly.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ def split_population(
 ) -> dict[str, Tensor]:
     """Split each of P parent primitives in two; return the parameters of the children, name -> (2 P, ...).
 
-    The first children of all parents come first, then all second children. Each child keeps its parent's density and
-    colour as functions of space. The children's centres lie on the parent's longest axis, at +-``shift`` x the
+    The first children of all parents come first, then all second children. Each child continues its parent's density
+    (exactly with a hard edge) and colour. The children's centres lie on the parent's longest axis, at +-``shift`` x the
     semi-axis from its centre. This semi-axis is multiplied by ``long_factor``, the other two by ``other_factor``.
 
     Args:
@@ -142,10 +142,11 @@ class RelocatePopulation(Population):
     """Strategy that moves primitives of little weight to where the error is largest, and adds primitives.
 
     A primitive's weight is the sum over pixels of alpha T, its share of the pixel. Its error is the same sum, with each
-    term multiplied by the pixel's error. Each primitive with a large error splits in two. One child replaces its
+    term multiplied by the pixel's error. The primitives with the largest errors split in two. One child replaces its
     parent, the other replaces a primitive with little weight; ``idle`` limits which ones. While there are fewer than
-    ``grow_to`` primitives, further ones split into an old and a new row. An intervention adds a quarter of all
-    primitives, or more if the remaining interventions would not reach ``grow_to``. Short budgets intervene sooner.
+    ``grow_to`` primitives, further ones split, and their second children are added. An intervention adds a quarter of
+    all primitives, or more if the remaining interventions would not reach ``grow_to``. If the budget is too short for
+    ``every``, interventions are more frequent.
     """
 
     def __init__(self, settings: PopulationSettings) -> None:
@@ -258,11 +259,11 @@ def _split_population_into_rows(
 class GradientPopulation(Population):
     """Strategy of the authors of the method: clone, split and remove primitives by the gradient of the density network.
 
-    A primitive's g is the gradient norm |dW1| + |db1| + |dw2| + |db2| of its network, averaged over the steps whose
-    views show the primitive. A primitive with g >= grow_threshold is cloned if its longest semi-axis is <= clone_scale
-    x extent: both copies stay in place and have half the density. Larger ones are split in two, with semi-axes / 1.6.
-    Splits are exact (method: "Population"). A primitive is removed if g < prune_threshold, if its longest semi-axis is
-    > prune_scale x extent, or if no view shows it.
+    A primitive's g is the gradient norm of its density parameters, |dW1| + |db1| + |dw2| + |db2|. It is averaged over
+    the steps whose views show the primitive. A primitive with g >= grow_threshold is cloned if its longest semi-axis is
+    <= clone_scale x extent: both copies stay in place and have half the density. Larger ones are split in two, with
+    semi-axes / 1.6 (:func:`split_population`). A primitive is removed if g < prune_threshold, if its longest semi-axis
+    is > prune_scale x extent, or if no view shows it.
     """
 
     def __init__(self, settings: PopulationSettings) -> None:

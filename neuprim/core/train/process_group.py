@@ -67,8 +67,8 @@ def read_torchrun_rank(environment: Mapping[str, str] = os.environ) -> TorchrunR
             raise ConfigError(f"environment: {name}={value}; expected less than {whole}={most}")
     if local_size > size or local_rank > rank:
         raise ConfigError(
-            f"environment: rank {rank} of {size} is {local_rank} of {local_size} on this machine: expected at "
-            f"most as many ranks on this machine as on all machines together"
+            f"environment: rank {rank} of {size} is {local_rank} of {local_size} on this machine; expected LOCAL_RANK "
+            "of at most RANK, and LOCAL_WORLD_SIZE of at most WORLD_SIZE"
         )
     address = f"{environment['MASTER_ADDR']}:{environment['MASTER_PORT']}"
     return TorchrunRank(rank, size, local_rank, local_size, address) if size > 1 else None

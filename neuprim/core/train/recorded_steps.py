@@ -200,7 +200,10 @@ class StepRecorder:
         self.reset()
 
     def take(self, tasks: list[ViewTask], samples: PointSamples | None, progress: float) -> StepReport | None:
-        """Replay a step and return its report. If it has no recording, return None; the trainer must take the step."""
+        """Replay a step and return its report. If it has no recording, return None; the trainer must take the step.
+
+        ``samples`` are points with known extinction, or None. ``progress`` is the used fraction of the training budget.
+        """
         trainer, sums = self.trainer, self.trainer.population.sums()
         if self._graphs.failed or self.capacity is None or trainer.fake_quantize is not None or trainer.zero_masks:
             return None
@@ -239,7 +242,10 @@ class StepRecorder:
         return report
 
     def settle(self, keep: int = 0) -> list[_Flight]:
-        """Read results of replayed steps but the last ``keep``; return a refused step and all after it, to repeat."""
+        """Read the results of all replayed steps but the last ``keep``, and resolve their reports.
+
+        If a step was refused, return it and all later steps, which the trainer must repeat; else return [].
+        """
         while len(self._flights) > keep:
             first = self._flights[0]
             if first.event is not None:
@@ -264,6 +270,7 @@ class StepRecorder:
         return []
 
     def _allocate(self) -> tuple[Tensor, Tensor]:
+        """Return two host tensors: for the numbers that a step sends to the device, and for its results."""
         views, channels = self.trainer.settings.views_per_step, self.trainer.dataset.channels
         size = views * (_NUMBERS + channels) + len(self.trainer.current_model.specs) + _NUMBERS
         given, found = (torch.zeros(size, dtype=torch.float64, pin_memory=self._on_gpu) for _ in range(2))
@@ -272,6 +279,7 @@ class StepRecorder:
     # ------------------------------------------------------------ recording
 
     def _find_program(self, inputs: _Inputs) -> _Program | None:
+        """Return the recording for inputs of these shapes; None until the shapes occur twice and there is room."""
         model, trainer, programs = self.trainer.current_model, self.trainer, self._programs
         stages = (model.density.stage, model.colour.stage, trainer.has_anisotropy_loss, trainer.limits_size)
         key = (stages, inputs.shapes())
@@ -368,6 +376,7 @@ class StepRecorder:
         return torch.cat([self._refused.double(), *numbers]), tuple(parts)
 
     def _draw(self, view: View, background: Tensor) -> RenderOutput:
+        """Render a view into arrays of the fixed sizes ``capacity``."""
         from neuprim.core.render.cuda.backend import render
 
         lowered = self.trainer.current_model.lower(view.camera, view.conditions, self.trainer.renderer)

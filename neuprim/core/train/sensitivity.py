@@ -43,7 +43,7 @@ class Sensitivity:
     columns: dict[str, Tensor]
 
     def combine(self, other: Sensitivity, weight: float) -> Sensitivity:
-        """Return these effects plus ``weight`` times the effects in ``other``."""
+        """Return these effects plus ``weight`` times the effects in ``other``; the counts ``seen`` are added."""
         pieces = {name: value + weight * other.pieces[name] for name, value in self.pieces.items()}
         columns = {name: value + weight * other.columns[name] for name, value in self.columns.items()}
         return Sensitivity(self.whole + weight * other.whole, self.seen + other.seen, pieces, columns)

@@ -135,8 +135,8 @@ class PopulationSettings:
         validate_fields(self, "train.population")
         if self.grow_from < 1 and self.strategy != "relocate":
             raise ConfigError(
-                f"train.population.grow_from={self.grow_from:g}: {self.strategy} does not grow that way; expected "
-                f"train.population.strategy=relocate"
+                f"train.population.grow_from={self.grow_from:g}: strategy={self.strategy} does not use this setting; "
+                "expected train.population.strategy=relocate, or grow_from=1"
             )
 
 

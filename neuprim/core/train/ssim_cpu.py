@@ -1,10 +1,10 @@
 """L1 + SSIM loss of two images x and y, and its analytic gradient with respect to x, on all CPU cores.
 
 SSIM uses an 11 x 11 Gaussian window (sigma 1.5), as two blurs of 11 taps, and only windows inside the image. With the
-window means a = E[x], b = E[y], A = 2ab + c1, B = 2(E[xy] - ab) + c2, C = a^2 + b^2 + c1 and D = E[xx] - a^2 + E[yy] -
-b^2 + c2, SSIM is AB/(CD). The adjoint of the blur turns its derivatives by E[x], E[xx] and E[xy] into a gradient per
-pixel. Where both images are equal, as in an empty background, SSIM is 1 and the gradient 0. So columns at the left and
-right that are equal in all rows of a window are skipped.
+window means a = E[x] and b = E[y], SSIM is AB/(CD). A = 2ab + c1, B = 2(E[xy] - ab) + c2, C = a^2 + b^2 + c1 and D =
+E[xx] - a^2 + E[yy] - b^2 + c2, with c1 = 0.01^2 and c2 = 0.03^2. The adjoint of the blur turns SSIM's derivatives by
+E[x], E[xx] and E[xy] into a gradient per pixel. Where both images are equal, as in an empty background, SSIM is 1 and
+the gradient 0. So columns at the left and right that are equal in all rows of a window are skipped.
 """
 
 from __future__ import annotations
@@ -58,6 +58,7 @@ def _vertical_loss_moments(V, x, y, at, pitch, count):  # type: ignore[no-untype
 
 @inline
 def _blur_loss_columns(V, g, at, pitch, count):  # type: ignore[no-untyped-def]
+    """Fill V[:count] with the vertical blur of the flat map ``g`` from position ``at``; ``pitch`` numbers per row."""
     for j in range(count):
         s = f(0)
         for k in range(SSIM_TAPS):
@@ -67,6 +68,7 @@ def _blur_loss_columns(V, g, at, pitch, count):  # type: ignore[no-untyped-def]
 
 @inline
 def _blur_loss_rows(out, V, step, count):  # type: ignore[no-untyped-def]
+    """Fill out[:count] with the horizontal blur of ``V``, in which neighbouring pixels are ``step`` numbers apart."""
     for j in range(count):
         s = f(0)
         for k in range(SSIM_TAPS):

@@ -424,7 +424,7 @@ class Trainer:
             if view is not None:
                 bad_pixels = not bool(torch.isfinite(view.truth).all())
                 where = f"view {view.name}{', whose pixels are NaN or infinite somewhere' if bad_pixels else ''}"
-            raise NonFiniteError(f"loss is {cost} at step {self.step} on {where}")
+            raise NonFiniteError(f"loss is {cost} at step {self.step} on {where}; check the data or lower train.rates")
         loss.backward()
         return cost, parts, psnr
 

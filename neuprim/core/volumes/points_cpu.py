@@ -58,7 +58,8 @@ class CosinePointValues(torch.autograd.Function):
     """Autograd function for sums of cosine densities at M points; the result is (M, 1 + C) float32.
 
     Column 0 is the extinction, the sum of sigma_i over primitives i; the C others are sums weighted by ``weights`` (N,
-    C). Arguments with a gradient: (means, log_scales, quats, W1, b1, w2, b2, weights), each with one row per primitive.
+    C). ``cells`` has the points and ``edge`` is the exponent p. The backward pass fills ``shares``, a PointShares.
+    Arguments with a gradient: (means, log_scales, quats, W1, b1, w2, b2, weights), each with one row per primitive.
     """
 
     @staticmethod
@@ -251,6 +252,7 @@ def _point_cells_of_primitive(cells, reach, means, n):  # type: ignore[no-untype
 
 @inline
 def _whiten_density_point_offset(A, n, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Return the offset (dx, dy, dz) from primitive n's centre in whitened space (see _prepare_point_axes)."""
     y0 = A[n, 0, 0] * dx + A[n, 0, 1] * dy + A[n, 0, 2] * dz
     y1 = A[n, 1, 0] * dx + A[n, 1, 1] * dy + A[n, 1, 2] * dz
     y2 = A[n, 2, 0] * dx + A[n, 2, 1] * dy + A[n, 2, 2] * dz
@@ -303,9 +305,10 @@ def _add_density_point_values(start, stop, cells, reach, prims, edge, chunk, sum
 
 @kernel
 def _density_point_values_backward(start, stop, cells, reach, prims, edge, pulled, error, gradients, shares):  # type: ignore[no-untyped-def]
-    """Fill the gradients of ``prims`` from ``pulled`` (M, 1 + C), the gradients of the sums at M points.
+    """Fill ``gradients``, given as zeros, of ``prims`` from ``pulled`` (M, 1 + C), the gradients of the sums at points.
 
-    ``shares`` (N, 2) gets each primitive's sums over points of its extinction sigma and of sigma x ``error``.
+    ``pulled`` and ``error`` (M,) are in the order of ``cells``. ``shares`` (N, 2) gets each primitive's sums over
+    points of its extinction sigma and of sigma x ``error``.
     """
     points, starts, counts = cells.points, cells.starts, cells.counts
     means, A, rate, phase, amplitude, offset, colors = prims

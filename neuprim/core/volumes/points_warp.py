@@ -2,8 +2,8 @@
 """GPU path of :mod:`neuprim.core.volumes.points`: sums of cosine densities at points, by Warp kernels in float64.
 
 A thread adds up part of the primitives at one point or, in the backward pass, part of the points of one primitive. The
-parts are summed in a fixed order, so reruns give the same bits. The points are not sorted into a grid: for a few
-thousand, a test of every point against every primitive's box takes only a few instructions each.
+parts are summed in a fixed order, so reruns give the same bits. The points are not sorted into a grid. For a few
+thousand points, testing each against every primitive's box takes only a few instructions per test.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ _MARGIN = 1 + 1e-12  # of the boxes around ellipsoids: rounding must not leave o
 
 
 def cosine_point_values(geometry: Geometry, form: Cosine, points: Tensor, weights: Tensor, shares: Any) -> Tensor:
-    """Return (M, 1 + C) float32 extinction and weighted extinctions at ``points`` (M, 3), without waiting for the GPU.
+    """Return (M, 1 + C) float32 sums over N primitives at ``points`` (M, 3): extinction, and extinction x ``weights``.
 
-    All values are NaN if a parameter is not finite. Differentiable except in the points; the backward pass fills
-    ``shares``.
+    The host does not wait for the GPU. All values are NaN if a parameter is not finite. Differentiable except in the
+    points; the backward pass fills ``shares`` (:class:`~neuprim.core.volumes.points.PointShares`).
 
     Args:
         weights: (N, C) factors of the extinction of each primitive.

@@ -80,6 +80,7 @@ def apply_time_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor
 
 @exact_kernel
 def _move_in_time_backward(velocity, acceleration, since, pulled, g_velocity, g_acceleration, g_center):  # type: ignore[no-untyped-def]
+    """Fill the gradients ``g_...`` from ``pulled``, that of the moved centres; ``since`` (N, 1) is xi - center."""
     for n in range(since.shape[0]):
         total = 0.0
         for j in range(3):

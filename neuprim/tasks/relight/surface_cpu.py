@@ -65,6 +65,7 @@ def _positive(value):  # type: ignore[no-untyped-def]
 def _surface_colors(  # type: ignore[no-untyped-def]
     start, stop, means, sizes, normal, albedo, highlight, log_gloss, indirect, light, eye, color
 ):
+    """Fill ``color`` (N, 2, C) of primitives ``start:stop``; for arguments and result see ``surface_colors``."""
     lobes, numbers = log_gloss.shape[1], indirect.shape[1]
     weights = np.empty(lobes)
     for i in range(start, stop):

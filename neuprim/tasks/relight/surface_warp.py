@@ -39,6 +39,7 @@ def _pull_back(g: wp.vec3d, v: wp.vec3d, over: wp.float64, shortest: wp.float64)
 
 @wp.func
 def _positive(value: float):
+    """Return max(0, ``value``) as float64; NaN stays NaN."""
     if value < 0.0:
         return d(0.0)
     return d(value)
@@ -50,6 +51,7 @@ def _forward(
     albedo: wp.array2d(dtype=float), highlight: wp.array3d(dtype=float), log_gloss: wp.array2d(dtype=float),
     indirect: wp.array3d(dtype=float), places: wp.array(dtype=wp.vec3d), color: wp.array3d(dtype=float),
 ):  # fmt: skip
+    """Write direct colours to ``color[i, 0]``, indirect ones to ``color[i, 1]``; ``places``: light and eye."""
     i = wp.tid()
     shortest = _SHORTEST * d(sizes[i])
     n, l, v = wp.vec3d(normal[i]), places[0] - wp.vec3d(means[i]), places[1] - wp.vec3d(means[i])
@@ -80,6 +82,7 @@ def _backward(
     g_places: wp.array2d(dtype=wp.vec3d), g_normal: wp.array(dtype=wp.vec3), g_albedo: wp.array2d(dtype=float),
     g_highlight: wp.array3d(dtype=float), g_log_gloss: wp.array2d(dtype=float), g_indirect: wp.array3d(dtype=float),
 ):  # fmt: skip
+    """Write gradients of :func:`_forward` from ``grad``; ``g_places[i]`` are those of the offsets to light and eye."""
     i = wp.tid()
     shortest = _SHORTEST * d(sizes[i])
     own, to_light, to_eye = wp.vec3d(normal[i]), places[0] - wp.vec3d(means[i]), places[1] - wp.vec3d(means[i])

@@ -1,1 +1,1 @@
-"""The cpu backend, in numba on all cores. Projects primitives in float64; computes pixels in float32."""
+"""The ``cpu`` backend, in numba on all cores. Primitives are projected in float64, most pixels computed in float32."""

@@ -73,7 +73,7 @@ def _cpu_array(tensor: Tensor) -> Array:
 
 
 def _rasterizer_arrays_by_name(tensors: Sequence[Tensor]) -> dict[str, Array]:
-    """Return tensors as numpy arrays by name; all as float64 if dtypes differ, because kernels take only one dtype."""
+    """Return tensors (PARAMETERS, then NET) as numpy arrays by name; float64 if dtypes differ: kernels take one."""
     arrays = [_cpu_array(x) for x in tensors]
     if len({x.dtype for x in arrays}) > 1:
         arrays = [x.astype(np.float64, copy=False) for x in arrays]
@@ -99,6 +99,7 @@ def _rasterizer_view(camera: Camera, viewmat: Tensor, near: float, turns: float)
 def _prepare_frame(
     request: RasterRequest, viewmat: Tensor, tensors: Sequence[Tensor], images: tuple[Array, int] | None = None
 ) -> _PreparedFrame:
+    """Return a frame's data; ``images`` is (image index (N,) of each primitive, number of images), None for one."""
     camera, settings = request.camera, request.settings
     arrays, threads = _rasterizer_arrays_by_name(tensors), settings.threads
     parameters = PrimitiveArrays(*(arrays[name] for name in PARAMETERS))
@@ -260,7 +261,10 @@ def render(
 def render_slabs(
     lowered: LoweredPrimitives, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
-    """Render all slabs (groups of primitives) in one frame; see :func:`neuprim.core.render.render_slabs`."""
+    """Render each slab (group of primitives) alone, all in one pass; return (count, H, W) opacities and mean depths.
+
+    For arguments see :func:`neuprim.core.render.render_slabs`. A slab without primitives has opacity 0.
+    """
     means = lowered.geometry.means
     request = RasterRequest.of(lowered, camera, settings, RenderStats("cpu", len(means)))
     frame = _prepare_frame(request, camera.viewmat, rasterizer_tensors(lowered), (slabs.numpy(), count))

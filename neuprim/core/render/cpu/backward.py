@@ -1,8 +1,8 @@
-"""Backward pass of compositing sorted by the primitives' centres; goes back to front and recovers T as T/(1 - alpha).
+"""Backward pass for primitives sorted by the depth of their centres; goes back to front through each tile.
 
-T is a pixel's transmittance. A lane is one pixel of a (tile, primitive) pair. The forward pass saved the lanes' optical
-depths. Each pair writes one row of gradients. The rows of a primitive are added in a fixed order, so any number of
-threads gives the same bits.
+T is a pixel's transmittance. T before a primitive is T behind it divided by (1 - alpha). A lane is one pixel of a
+(tile, primitive) pair. The forward pass saved the lanes' optical depths. Each pair writes one row of gradients. The
+rows of a primitive are added in a fixed order, so any number of threads gives the same bits.
 """
 
 from __future__ import annotations
@@ -77,9 +77,10 @@ def lane_optical_depths(S, n, edge):  # type: ignore[no-untyped-def]
 
 @inline
 def lane_opacities(S, n, amin, amax):  # type: ignore[no-untyped-def]
-    """Fill ALPHA, the opacity of ``n`` lanes (pixels), 1/(1 - alpha) and SLOPE from DEPTH, the optical depth.
+    """Fill ALPHA, the opacity of ``n`` lanes (pixels), OVER = 1/(1 - alpha) and SLOPE from DEPTH, the optical depth.
 
-    SLOPE is d alpha/d(2 FIELD HALF FADE), the derivative by the density integral. ``amin`` and ``amax`` bound alpha.
+    SLOPE is d alpha/d(2 FIELD HALF FADE), the derivative by the density integral. An opacity below ``amin`` becomes 0,
+    one above ``amax`` becomes ``amax``; SLOPE is then 0.
     """
     for k in range(n):
         norm, depth = S[L.NORM_L + k], S[L.DEPTH + k]
@@ -100,7 +101,8 @@ def lane_opacities(S, n, amin, amax):  # type: ignore[no-untyped-def]
 def _uncomposite_rgb_row(state, S, base, at, sums, a, b, rank, color, net):  # type: ignore[no-untyped-def]
     """Undo the compositing of one primitive in a row of pixels, for three channels: recover transmittance T, fill GRAD.
 
-    With a ``net``, also fill dL/d RAY_COLOUR. Adds weights, errors and colour gradients to ``sums``.
+    With a ``net``, also fill dL/d RAY_COLOUR. Adds weights alpha T, weights x error and colour gradients to ``sums``,
+    16 numbers each. For the other arguments see ``_composite_rgb_row`` in :mod:`~neuprim.core.render.cpu.forward`.
     """
     a, b = f(a), f(b)
     c0, c1, c2 = color[0], color[1], color[2]
@@ -190,7 +192,7 @@ def _uncomposite_row(state, S, base, at, cg, w, a, b, rank):  # type: ignore[no-
 def _add_row_sums(state, S, base, at, w, sums, a, b, C, net):  # type: ignore[no-untyped-def]
     """Add weights ``w``, w x error and colour gradients of one row of pixels to ``sums``; for any number of channels.
 
-    With a ``net``, also fill dL/d RAY_COLOUR.
+    ``sums`` has 16 numbers for each of these. With a ``net``, also fill dL/d RAY_COLOUR.
     """
     st = state[base:]
     for k in range(P.TILE):
@@ -211,7 +213,7 @@ def _add_row_sums(state, S, base, at, w, sums, a, b, C, net):  # type: ignore[no
 
 @inline
 def _compact_lane_gradients(S, n, with_depths):  # type: ignore[no-untyped-def]
-    """Move lanes (pixels) that have a gradient to the front, as many have none; append zeros; return their number."""
+    """Move lanes (pixels) with GRAD != 0 to the front, as many have GRAD = 0; append zeros; return the number moved."""
     count = 0
     for k in range(0, n, P.TILE):
         if with_depths:
@@ -268,8 +270,9 @@ def _load_tile_gradients(state, tx, ty, norms, image, C):  # type: ignore[no-unt
 def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, net, edge):  # type: ignore[no-untyped-def]
     """Fill the gradient rows of all (tile, primitive) pairs of tiles ``start:stop``; return the number of lanes.
 
-    ``live``, ``first_lane`` and ``depths`` are fields of :class:`~neuprim.core.render.cpu.forward.SavedForBackward`.
-    For the other arguments see :func:`~neuprim.core.render.cpu.forward.composite_tiles`.
+    ``image`` is an :class:`ImageGradient`. ``live``, ``first_lane`` and ``depths`` are fields of
+    :class:`~neuprim.core.render.cpu.forward.SavedForBackward`, ``depths`` of this chunk. For the other arguments see
+    :func:`~neuprim.core.render.cpu.forward.composite_tiles`.
     """
     frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
     live, first_lane, depths = borrow_array(live), borrow_array(first_lane), borrow_array(depths)
@@ -388,7 +391,8 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
 def sum_tile_pair_gradients(start, stop, first, slots, pair_rows, grads, touched):  # type: ignore[no-untyped-def]
     """Fill grads[i], the sum of the gradient rows of primitive i's pairs, and touched[i], for i in ``start:stop``.
 
-    A pair is a tile and a primitive that reaches it. touched[i] is True if a pixel shows the primitive.
+    A pair is a tile and a primitive that reaches it; ``first`` and ``slots`` are those of TileLists. touched[i] is True
+    if a pixel shows the primitive.
     """
     for i in range(start, stop):
         g = grads[i]

@@ -1,7 +1,8 @@
 """Compute geometry and neurons of 32 primitives (a block) at a time, in float64.
 
-A block is one flat array with a column of 32 numbers per quantity, at constant offsets, so that LLVM vectorises. Strict
-floating-point arithmetic gives each primitive the same bits in any block.
+A block is one flat array ``S`` with a column of 32 numbers per quantity: ``S[M + k]`` is the longest semi-axis m of the
+block's primitive k. Columns lie at constant offsets, so that LLVM vectorises. Strict floating-point arithmetic gives
+each primitive the same bits in any block.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ def dot3(a, b):  # type: ignore[no-untyped-def]
 
 @strict
 def load_block(which, n, parameters, S):  # type: ignore[no-untyped-def]
-    """Load geometry of primitives ``which[:n]``, and semi-axes over m, into a block; pad by repeating the last one."""
+    """Load MEANS, LOG_SCALES, QUATS, M and AXES (axes / m) of primitives ``which[:n]``; repeat the last as padding."""
     means, log_scales, quats = parameters.means, parameters.log_scales, parameters.quats
     for k in range(BLOCK):
         i = which[min(k, n - 1)]
@@ -79,7 +80,9 @@ def project_block(S, view):  # type: ignore[no-untyped-def]
     """Compute for each primitive of a block its orientation, its centre in camera coordinates and its anchor pixel.
 
     Fills B and LOCAL (orientation in camera and scene axes), INVERSE (1/|q|), CENTRE, ANCHOR_Z, UX and UY. The anchor
-    is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same value.
+    (UX, UY) is the pixel that shows the centre, at depth ANCHOR_Z. For a primitive near or behind the camera, the
+    anchor is the camera, with depth 0. Pixel and depth are rounded to float32 *before* they are used, so that the pixel
+    kernels subtract exactly the same values.
     """
     R, t, fx, fy, cx, cy, near = view.R, view.t, view.fx, view.fy, view.cx, view.cy, view.near
     r0, r1, r2 = (R[0, 0], R[0, 1], R[0, 2]), (R[1, 0], R[1, 1], R[1, 2]), (R[2, 0], R[2, 1], R[2, 2])
@@ -111,8 +114,8 @@ def _whiten_axis(b, s, u, v, fx, fy, w):  # type: ignore[no-untyped-def]
     """Return the parts along one ellipsoid axis of four vectors in whitened space, where the ellipsoid is a unit ball.
 
     They are E0, the direction of the ray at (``u``, ``v``) on the image plane z = 1; EX and EY, the changes of the
-    direction per pixel; and XA, the vector ``w``. ``b`` is the axis in camera axes, ``s`` the semi-axis divided by the
-    longest semi-axis, and ``fx``, ``fy`` are focal lengths in pixels.
+    direction per pixel; and XA, the vector ``w`` from centre to anchor over m. ``b`` is the axis in camera axes, ``s``
+    the semi-axis divided by the longest semi-axis m, and ``fx``, ``fy`` are focal lengths in pixels.
     """
     a0, a1, a2 = b[0] / s, b[1] / s, b[2] / s
     return a0 * u + a1 * v + a2, a0 / fx, a1 / fy, dot3((a0, a1, a2), w)
@@ -120,7 +123,7 @@ def _whiten_axis(b, s, u, v, fx, fy, w):  # type: ignore[no-untyped-def]
 
 @strict
 def _fill_block_rays(S, view):  # type: ignore[no-untyped-def]
-    """Fill a block's rays in whitened space, and TOTAL and BIGGEST, which reveal values not finite in float32."""
+    """Fill a block's rays (E0 to NEAR), and sum (TOTAL) and maximum (BIGGEST) to detect overflow in float32."""
     fx, fy, cx, cy, near = view.fx, view.fy, view.cx, view.cy, view.near
     for k in range(BLOCK):
         m, anchor_z, offset = S[M + k], S[ANCHOR_Z + k], S[BLOCK * P.OFFSET + k]
@@ -150,7 +153,8 @@ def _fill_block_rays(S, view):  # type: ignore[no-untyped-def]
 def _fill_block_neurons(which, n, parameters, turns, S, waves):  # type: ignore[no-untyped-def]
     """Fill ``waves`` (K, 6 BLOCK) with the neurons of a block of primitives: frequencies, phase, amplitude and speed.
 
-    The speed is the length of the frequency vector, in turns per m.
+    Frequencies are on whitened axes. The speed is the length of the frequency vector: the largest change of the phase
+    over half a chord, in turns.
     """
     W1, b1, w2 = parameters.W1, parameters.b1, parameters.w2
     for k in range(BLOCK):
@@ -179,7 +183,7 @@ def _fill_block_neurons(which, n, parameters, turns, S, waves):  # type: ignore[
 
 @strict
 def fill_block(which, n, parameters, view, S, waves):  # type: ignore[no-untyped-def]
-    """Compute geometry, rays and neurons of primitives ``which[:n]``; fill their block ``S`` and ``waves``."""
+    """Compute geometry, rays, neurons of primitives ``which[:n]``; fill their block ``S``, ``waves`` (K, 6 BLOCK)."""
     load_block(which, n, parameters, S)
     for k in range(BLOCK):
         S[BLOCK * P.OFFSET + k] = parameters.b2[which[min(k, n - 1)]]
@@ -190,9 +194,9 @@ def fill_block(which, n, parameters, view, S, waves):  # type: ignore[no-untyped
 
 @strict
 def store_row(k, S, waves, rate, order, row):  # type: ignore[no-untyped-def]
-    """Copy primitive ``k`` of a block to ``row``, with neurons sorted by rate (phase per length along the ray).
+    """Copy primitive ``k`` of a block to ``row``, with neurons sorted by speed, the length of the frequency vector.
 
-    Also fills ``rate`` with the sorted rates and ``order`` with the neurons' indices.
+    Also fills ``rate`` (K,) with the sorted speeds and ``order`` (K,) with the neurons' indices.
     """
     for j in range(P.NEURONS):
         row[j] = S[j * BLOCK + k]

@@ -1,11 +1,13 @@
 """The integral along one chord (part of a ray inside an ellipsoid) in float32, forward and backward.
 
-cos, sinc and B_p of a phase in turns, and the exponential, are polynomials (tools/fit_polynomials.py). Phases in turns
-are reduced exactly to half a turn: ``r = u - rint(u)``. B_p replaces sinc for a soft edge (density that fades to zero
-at the ellipsoid's boundary) of exponent p (:mod:`neuprim.core.model.edge`). A neuron's rate v is the change of its
-phase over half a chord, in turns; its profile is B_p(2 pi v). One polynomial serves |v| up to half a turn, a longer one
-up to 1.5 turns. Beyond, B_1 = 3 (B_0 - cos z)/z^2 and B_2 = 15 (B_1 - B_0)/z^2, with z = 2 pi v, dB_1/dz = -3 (B_1 -
-B_0)/z and dB_2/dz = -5 (B_2 - B_1)/z. float32 errors are below 2e-6 (tests/numerics).
+Phases are in turns (2 pi) and are reduced exactly to half a turn: ``r = u - rint(u)``. A neuron's rate v is the change
+of its phase over half a chord, in turns. Its mean over the chord is its value at the middle times its profile, which is
+B_p(2 pi v). p is the exponent of the edge (:mod:`neuprim.core.model.edge`). B_0 is sinc, for a hard edge; B_1 and B_2
+are for a soft edge (density that fades to zero at the ellipsoid's boundary).
+
+cos, B_p and the exponential are polynomials (tools/fit_polynomials.py). One polynomial serves |v| up to half a turn, a
+longer one up to 1.5 turns. Beyond, with z = 2 pi v, B_1 = 3 (B_0 - cos z)/z^2 and B_2 = 15 (B_1 - B_0)/z^2. Their
+derivatives are dB_1/dz = -3 (B_1 - B_0)/z and dB_2/dz = -5 (B_2 - B_1)/z. float32 errors: below 2e-6.
 """
 
 from __future__ import annotations
@@ -162,6 +164,7 @@ def _hard_sincs_slow(v, w):  # type: ignore[no-untyped-def]
 
 @inline
 def _hard_slopes_slow(v, w):  # type: ignore[no-untyped-def]
+    """Return sinc(2 pi v), its derivative by v, sinc(2 pi w) and its derivative by w, for |v|, |w| <= 1/2."""
     y, z = v * v, w * w
     return sinc_turns(y), dsinc_turns(y) * _TWO * v, sinc_turns(z), dsinc_turns(z) * _TWO * w
 
@@ -174,6 +177,7 @@ def _hard_sincs_medium(v, w):  # type: ignore[no-untyped-def]
 
 @inline
 def _hard_slopes_medium(v, w):  # type: ignore[no-untyped-def]
+    """Return sinc(2 pi v), its derivative by v, sinc(2 pi w) and its derivative by w, for |v|, |w| <= 3/2."""
     y, z = v * v * _TO_UNIT - _ONE, w * w * _TO_UNIT - _ONE
     return (
         _chord_sinc_medium(y),
@@ -185,7 +189,7 @@ def _hard_slopes_medium(v, w):  # type: ignore[no-untyped-def]
 
 @inline
 def _reduced_chord_rates(v, w):  # type: ignore[no-untyped-def]
-    """Return rates v and w minus the nearest integers, whether |v|, |w| <= 1/2, and 1/v and 1/w (1 if <= 1/2)."""
+    """Return six values: v and w minus the nearest integers, whether |v|, |w| <= 1/2, and 1/v, 1/w (1 if <= 1/2)."""
     k, j = np.rint(v), np.rint(w)
     a, b = k == f(0), j == f(0)
     sv, sw = f(1) if a else v, f(1) if b else w
@@ -237,6 +241,7 @@ def _split_chord_polynomial(coefficients: tuple[float, ...]) -> Kernel:
 
 
 def _slow_chord_profiles(p: int) -> tuple[Kernel, Kernel]:
+    """Return both functions of :func:`_fast_chord_profiles` for edge exponent ``p``, 1 or 2, and |v|, |w| <= 1/2."""
     value, slope = _horner_polynomial(_SLOW[p]), _horner_polynomial(_SLOW_SLOPE[p])
 
     @inline
@@ -252,6 +257,7 @@ def _slow_chord_profiles(p: int) -> tuple[Kernel, Kernel]:
 
 
 def _medium_chord_profiles(p: int) -> tuple[Kernel, Kernel]:
+    """Return both functions of :func:`_fast_chord_profiles` for edge exponent ``p``, 1 or 2, and |v|, |w| <= 3/2."""
     value, slope = _split_chord_polynomial(_MEDIUM[p]), _split_chord_polynomial(_MEDIUM_SLOPE[p])
 
     @inline
@@ -267,6 +273,7 @@ def _medium_chord_profiles(p: int) -> tuple[Kernel, Kernel]:
 
 
 def _soft_reduced(p: int) -> Kernel:
+    """Return a function like :func:`_hard_reduced` for a soft edge of exponent ``p``, 1 or 2."""
     value, slope = _horner_polynomial(_SLOW[p]), _horner_polynomial(_SLOW_SLOPE[p])
     first = p == 1
 
@@ -293,7 +300,8 @@ def _soft_reduced(p: int) -> Kernel:
 def _fast_chord_profiles(reduced: Kernel) -> tuple[Kernel, Kernel]:
     """Return two functions of the rates v and w of two neurons, for rates of any size.
 
-    Both give B_p(2 pi v) and B_p(2 pi w); the second also gives their derivatives by v and w.
+    The first gives B_p(2 pi v) and B_p(2 pi w). The second gives B_p(2 pi v), its derivative by v, B_p(2 pi w), and its
+    derivative by w. ``reduced`` computes B_p, see :func:`_hard_reduced`.
     """
 
     @inline
@@ -339,11 +347,15 @@ def load_ray(p):  # type: ignore[no-untyped-def]
 
 @inline_source
 def intersect_chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
-    """Intersect one pixel's ray with a primitive; return the values of the chord, of which the last is ``half``.
+    """Intersect one pixel's ray with a primitive's ellipsoid; return 16 numbers that describe the chord.
 
-    The values are named as in :mod:`neuprim.core.render.cpu.layout`; ``half`` is 0 if the ray misses. ``pixel`` is 16 y
-    + x in the tile, (``fx0``, ``fy0``) the offset of the tile's first pixel centre from the anchor, and ``row`` the
-    result of :func:`load_ray`.
+    They are: offset du, dv from the anchor pixel; slide (see :mod:`neuprim.core.render.layout`); ray direction e (3)
+    and point p (3) closest to the centre, both in whitened space; D = 1 - |p|^2; ia = 1/(e.e); t of p; half the uncut
+    chord; uncut (1 if the near plane does not cut, else 0); middle t and half length of the chord beyond the near
+    plane. The last is 0 if the ray misses. Lengths are in units of m along e.
+
+    ``pixel`` is 16 y + x in the tile, (``fx0``, ``fy0``) the offset of the tile's first pixel centre from the anchor.
+    ``row`` is the result of :func:`load_ray`.
     """
     e0, e1, e2, x0, x1, x2, y0, y1, y2, a0, a1, a2, u0, u1, u2, v0, v1, v2, tu, tv, near = row
     y = np.floor(pixel * f(1 / P.TILE))
@@ -374,7 +386,8 @@ def intersect_chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
 def half_chord_slope(D, ia, depth_floor, edge):  # type: ignore[no-untyped-def]
     """Return dh/dD of the half chord h = sqrt(D ``ia``); a hard edge takes it at D of at least ``depth_floor``.
 
-    D is 0 at a silhouette. A soft edge needs no such floor, because its weight D^p outweighs D^-1/2.
+    ``ia`` is 1/(e.e) for the ray direction e. D is 0 at a silhouette. A soft edge needs no such floor, because its
+    weight D^p outweighs D^-1/2.
     """
     return f(0.5) * ia / np.sqrt(max(D, depth_floor if len(edge) == 0 else f(1e-12)) * ia)
 
@@ -397,11 +410,12 @@ def chord_edge_fade(D, edge):  # type: ignore[no-untyped-def]
 def chord_backward(  # type: ignore[no-untyped-def]
     g_half, g_mid, g_tm, gD, gA, half, ex, ey, ez, px, py, pz, mid, tm, ia, h, uncut, dh, qx, qy, qz, vx, vy, vz,
 ):  # fmt: skip
-    """Return dL/dm and dL/de of a ray with origin m and direction e, from the gradients of its chord.
+    """Return dL/dm (3) and dL/de (3) of a ray with origin m and direction e, from the gradients of its chord.
 
     ``g_half`` and ``g_mid`` are the gradients by half chord and middle along the ray; q is dL/d(chord's middle point)
-    and v is dL/d(half e). ``g_tm``, ``gD`` and ``gA`` are the gradients by closest approach tm, D = 1 - |p|^2 (p is the
-    closest point) and a = e.e, without the parts through the chord's ends.
+    and v is dL/d(half e). ``g_tm``, ``gD`` and ``gA`` are the gradients by closest approach tm, D = 1 - |p|^2 and a =
+    e.e, with p the closest point. They exclude the parts through the chord's ends. ``dh`` is dh/dD. The other arguments
+    are results of :func:`intersect_chord`.
     """
     gex, gey, gez = vx * half + mid * qx, vy * half + mid * qy, vz * half + mid * qz
     gt1 = (g_mid + g_half) * f(0.5)
@@ -428,7 +442,9 @@ def zero_ray_sums():  # type: ignore[no-untyped-def]
 def add_ray_gradient(sums, du, dv, slide, reach, gmx, gmy, gmz, gex, gey, gez):  # type: ignore[no-untyped-def]
     """Return ``sums`` plus one pixel's gradient by the 12 numbers E0, EX, EY, XA that define a primitive's rays.
 
-    dL/d(ray origin m) and dL/d(ray direction e) of the pixel are given; ``reach`` is tc + slide.
+    dL/d(ray origin m) and dL/d(ray direction e) of the pixel are given; ``du`` and ``dv`` are its offset from the
+    anchor pixel. ``slide`` is how far the origin is slid along the ray; ``reach`` is the anchor's depth over m, TC,
+    plus ``slide``.
     """
     a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, b0, b1 = sums
     hx, hy, hz = gex + reach * gmx, gey + reach * gmy, gez + reach * gmz

@@ -1,10 +1,10 @@
 """Colour networks (:class:`~neuprim.core.model.forms.RayNet`), one per primitive, evaluated in each pixel.
 
-The input of a network is the middle of a ray's chord, which the density's pixel stage stores for each lane (a pixel of
-one (tile, primitive) pair). The first layer is converted in float64 to whitened axes (units of the semi-axes) and to
-turns, once per primitive, like the density's neurons. The conversion does not depend on the camera. RAY_COLOUR holds
-colours before max(0, .). Three channels have fused loops. Other numbers of channels, and float64, use scratch memory
-``V``.
+The input of a network is the middle of a ray's chord, which the density's kernels store for each lane (a pixel of one
+(tile, primitive) pair). The first layer is converted in float64 to whitened axes (units of the semi-axes) and to turns,
+once per primitive, like the density's neurons. The conversion does not depend on the camera. RAY_COLOUR holds colours
+before max(0, .). Three channels have fused loops. Other numbers of channels, float64 and gradients use scratch memory
+``V``: for each unit, the cosine and its derivative.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def _fill_net_rows(start, stop, which, log_scales, quats, Wx, bias, Wout, out, f
 
 
 def prepare_rasterizer_colour_net(which: Array, t: dict[str, Array], wide: bool, threads: int) -> tuple[Array, Array]:
-    """Return the network rows of primitives ``which``, float64 if ``wide``, and (len(which),) bool: which need float64.
+    """Return the network rows of primitives ``which``, float64 if ``wide``, and whether each needs float64, as bool.
 
     A network needs float64 if the phase of a unit changes too fast along a chord. ``t`` holds the tensors by name.
     """
@@ -94,8 +94,8 @@ def colour_net_backward(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Compute the networks' gradients of primitives ``start:stop`` from gradient rows; they begin at column ``first``.
 
-    Adds to ``g_log_scales`` and ``g_quats``. The gradient through the chord's middle is already part of the density's
-    columns.
+    ``grads`` are the gradient rows, ``rows`` the network rows. Primitives that are not ``touched`` are skipped. Adds to
+    ``g_log_scales`` and ``g_quats``. The gradient through the chord's middle is already part of the density's columns.
     """
     H, C = Wx.shape[1], g_Wout.shape[1]
     local, gL, axes, gl, q, gq = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(4), np.empty(4)
@@ -155,7 +155,8 @@ def _ray_rgb_unit(p, o):  # type: ignore[no-untyped-def]
 def _add_ray_rgb_units(S, V0, V1, n, p, o, o2, slopes):  # type: ignore[no-untyped-def]
     """Add the outputs of two network units at ``n`` lanes (pixels) to RAY_COLOUR, for three channels.
 
-    With ``slopes``, store each unit's cosine and its derivative by the phase in turns in ``V0`` and ``V1``.
+    The units begin at columns ``o`` and ``o2`` of the network row ``p``. With ``slopes``, store each unit's cosine and
+    its derivative by the phase in turns in ``V0`` and ``V1``.
     """
     ax, ay, az, ab, a0, a1, a2 = _ray_rgb_unit(p, o)
     bx, by, bz, bb, b0, b1, b2 = _ray_rgb_unit(p, o2)
@@ -214,7 +215,8 @@ def _mix_net_outputs(S, V, n, p, hidden, C):  # type: ignore[no-untyped-def]
 def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-untyped-def]
     """Evaluate the colour network of primitive ``i`` at ``n`` lanes (pixels); fill RAY_COLOUR, before max(0, .).
 
-    ``base`` is the constant colour. With ``slopes``, also fill ``V`` for :func:`ray_colour_gradient`.
+    ``base`` is the constant colour. ``D`` has the float64 chords if the primitive is drawn in float64 (has a slot).
+    With ``slopes``, also fill ``V`` for :func:`ray_colour_gradient`.
     """
     C, p = base.shape[0], net.rows[i]
     for c in range(C):
@@ -237,7 +239,7 @@ def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-unt
 
 @inline
 def _rgb_units_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped-def]
-    """For three channels: write the gradients of two network units into ``out``; add to dL/dQ, Q the chord's middle."""
+    """For three channels: write the gradients of two units into row ``out``; add to dL/dQ, Q the chord's middle."""
     ax, ay, az, _, a0, a1, a2 = _ray_rgb_unit(p, o)
     bx, by, bz, _, b0, b1, b2 = _ray_rgb_unit(p, o2)
     s0, s1, s2, s3, s4, s5, s6 = f(0), f(0), f(0), f(0), f(0), f(0), f(0)
@@ -275,7 +277,7 @@ def _rgb_units_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped
 def _unit_gradient(S, V0, n, p, o, C, out):  # type: ignore[no-untyped-def]
     """For any number of channels: write a network unit's gradients into ``out``; add to dL/dQ, Q the chord's middle.
 
-    Overwrites the unit's cosines in ``V0``.
+    The unit begins at column ``o`` of the network row ``p``. Overwrites its cosines in ``V0``.
     """
     wx, wy, wz = p[o + P.WX], p[o + P.WY], p[o + P.WZ]
     for c in range(C):

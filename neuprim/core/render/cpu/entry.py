@@ -1,10 +1,11 @@
 """Compositing in the order in which each ray enters the primitives (``sort = "entry"``), forward and backward.
 
-For each tile of 16 x 16 pixels, a pass over its primitives lists the hits (pixels whose ray meets a primitive). Each
-pixel's hits are sorted and composited front to back. The backward pass repeats this and computes the gradient by the
-density integral (GRAD) of every hit, back to front. A second pass over the primitives then writes the same gradient
-rows as the default kernel. No pixel can stop early, so hidden primitives take time. Hits whose entries agree in
-float32, and chords cut by the near plane, stay in the order of the primitives' centres.
+For each tile of 16 x 16 pixels, a pass over its primitives lists the hits. A hit is a pixel and a primitive with
+opacity above 0 in it. Each pixel's hits are sorted and composited front to back. The backward pass repeats this and
+computes the gradient by the density integral (GRAD) of every hit, back to front. A second pass over the primitives then
+writes the same gradient rows as the default kernel. No pixel can stop early, so hidden primitives take time. Chords cut
+by the near plane come first. They, and hits whose entries agree in float32, stay in the order of the primitives'
+centres.
 """
 
 from __future__ import annotations
@@ -35,7 +36,11 @@ Array = np.ndarray[Any, Any]
 
 
 class _PairLanes(NamedTuple):
-    """Scratch memory for the lanes of one (tile, primitive) pair; ``waves`` is None without a colour network."""
+    """Scratch memory for the lanes of one (tile, primitive) pair; ``waves`` is None without a colour network.
+
+    ``S`` and ``D`` hold the lanes in float32 and float64, ``state`` the tile's pixels. For ``bounds``, ``offset`` and
+    ``rows_live`` see :func:`row_spans` and :func:`compact_lanes`.
+    """
 
     S: Array
     D: Array
@@ -47,7 +52,11 @@ class _PairLanes(NamedTuple):
 
 
 class _Hits(NamedTuple):
-    """The hits of one tile (pixels whose ray meets a primitive), in the order of its (tile, primitive) pairs."""
+    """The hits of one tile (pixel and primitive with opacity above 0), in the order of its (tile, primitive) pairs.
+
+    ``values`` and ``marks`` have the columns above, and ``colours`` the channels, one row per hit. The hits of pair q
+    are ``pair_start[q]`` to ``pair_start[q + 1]`` - 1. For ``listing`` and ``pixel_start`` see :func:`_sort_tile_hits`.
+    """
 
     values: Array
     marks: Array
@@ -116,9 +125,9 @@ def _load_tile_norms(lanes, norms, tx, ty):  # type: ignore[no-untyped-def]
 
 @inline
 def _list_tile_hits(lanes, hits, frame, first, end, tx, ty, colors, net, edge):  # type: ignore[no-untyped-def]
-    """List the hits of a tile (pixels whose ray meets a primitive); return (number of hits, number of evaluated lanes).
+    """List the hits of a tile; return (number of hits, number of evaluated lanes).
 
-    A lane is one pixel of a (tile, primitive) pair.
+    A lane is one pixel of a (tile, primitive) pair, a hit a lane with opacity above 0.
     """
     S, D, offset, bounds = lanes.S, lanes.D, lanes.offset, lanes.bounds
     values, marks = hits.values, hits.marks
@@ -192,7 +201,8 @@ def _sort_tile_hits(count, hits):  # type: ignore[no-untyped-def]
 def composite_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # type: ignore[no-untyped-def]
     """Render tiles ``start:stop``, with each pixel's hits sorted by entry; return the number of evaluated lanes.
 
-    For arguments see :func:`~neuprim.core.render.cpu.forward.composite_tiles`; ``image.last`` counts hits per pixel.
+    For arguments see :func:`~neuprim.core.render.cpu.forward.composite_tiles`; ``image.last`` counts the composited
+    hits per pixel.
     """
     frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
     height, width = frame.norms.shape
@@ -239,9 +249,10 @@ def composite_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # t
 
 @inline
 def _uncomposite_hits(hits, ids, first, tx, ty, norms, colors, image, tmin, net):  # type: ignore[no-untyped-def]
-    """Composite the hits of a tile again, then go back to front: fill every hit's weight and GRAD.
+    """Composite the hits of a tile again, then go back to front: fill every hit's weight alpha T and GRAD.
 
-    GRAD is the gradient by the hit's density integral.
+    GRAD is the gradient by the hit's density integral. ``image`` is an ImageGradient, and ``first`` the tile's first
+    pair.
     """
     values, marks, listing, begin = hits.values, hits.marks, hits.listing, hits.pixel_start
     height, width = norms.shape
@@ -277,7 +288,7 @@ def _uncomposite_hits(hits, ids, first, tx, ty, norms, colors, image, tmin, net)
 def backward_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # type: ignore[no-untyped-def]
     """Fill the gradient rows of the pairs of tiles ``start:stop``, with hits sorted by entry; return the lane count.
 
-    Unlike :func:`~neuprim.core.render.cpu.backward.backward_tiles`, it composites again.
+    Unlike :func:`~neuprim.core.render.cpu.backward.backward_tiles`, which explains the arguments, it composites again.
     """
     frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
     across = (frame.norms.shape[1] + P.TILE - 1) // P.TILE

@@ -1,8 +1,9 @@
-"""Forward pass of compositing sorted by the primitives' centres, and the data that the pass saves for backward.
+"""Forward pass for primitives sorted by the depth of their centres: composite tiles, and save data for backward.
 
 A lane is one pixel of a (tile, primitive) pair. The pass saves the optical depth of every evaluated lane (4 bytes). Per
-pair it saves a mask of tile rows with unfinished pixels (2 bytes) and the index of its first lane (4 bytes). So the
-backward pass can composite before it evaluates a neuron.
+pair it saves a mask of tile rows with unfinished pixels (2 bytes) and the index of its first lane (4 bytes). From
+these, the backward pass gets all opacities without evaluating densities. For most primitives, it then evaluates only
+the lanes that have a gradient.
 """
 
 from __future__ import annotations
@@ -36,7 +37,11 @@ Array = np.ndarray[Any, Any]
 
 
 class TileImage(NamedTuple):
-    """Arrays that the forward kernels fill, and the (C,) background behind them; several images are stacked."""
+    """Images that the forward kernels fill, and the (C,) background. Several images are stacked along H.
+
+    w = alpha T is the weight of a sample (ray x primitive), and z the camera-z of its chord's middle. The rank of a
+    primitive is its position, from 0, in a tile's front-to-back list.
+    """
 
     # (H, W, C) and (H, W)
     rgb: Array
@@ -49,7 +54,11 @@ class TileImage(NamedTuple):
 
 @dataclass
 class SavedForBackward:
-    """Data that the forward pass of one frame saves for the backward pass; empty if no gradient is needed."""
+    """Data that the forward pass of one frame saves for the backward pass; empty if no gradient is needed.
+
+    A pair is (tile, primitive), a lane one of its pixels. A tile row is live until a check finds T < T_min in all its
+    pixels.
+    """
 
     # (pairs,) bit y is set if row y of the tile was live when the pair was drawn; no pairs if nothing is saved
     live: Array
@@ -73,7 +82,7 @@ def _live_tile_row_bits(rows_live):  # type: ignore[no-untyped-def]
 
 @inline
 def _depth_array(floats):  # type: ignore[no-untyped-def]
-    """Return uninitialised floats aligned to a cache line; the system provides memory only where it is written."""
+    """Return an uninitialised (floats,) float32 array, aligned to a cache line; unwritten pages take no memory."""
     block = np.empty(floats + 16, np.float32)
     shift = -(np.int64(block.ctypes.data) // 4) % 16
     return block[shift : shift + floats]
@@ -81,7 +90,7 @@ def _depth_array(floats):  # type: ignore[no-untyped-def]
 
 @inline
 def _max_lanes(start, stop, across, frame):  # type: ignore[no-untyped-def]
-    """Return an upper bound of the number of lanes (pixels) of tiles ``start:stop``, a multiple of the vector width."""
+    """Return a bound of the lanes (pixels of all pairs) of tiles ``start:stop``; pairs count multiples of 16."""
     lanes = 0
     for t in range(start, stop):
         tx, ty = (t % across) * P.TILE, (t // across) * P.TILE
@@ -92,9 +101,10 @@ def _max_lanes(start, stop, across, frame):  # type: ignore[no-untyped-def]
 
 @inline
 def _store_opacities(S, n, frame, edge, keep, depths, at):  # type: ignore[no-untyped-def]
-    """Compute ALPHA, the opacity of ``n`` lanes (pixels); if ``keep``, save their optical depths in ``depths[at:]``.
+    """Fill ALPHA, the opacity of ``n`` lanes (pixels), from their chords; if ``keep``, save optical depths.
 
-    Opacities below alpha_min and for integrals <= 0 become 0; others are at most alpha_max.
+    The optical depths go to ``depths[at:]``. Opacities below alpha_min, and of optical depths <= 0, become 0. Others
+    are at most alpha_max.
     """
     amin, amax = frame.alpha_min, frame.alpha_max
     for k in range(n):
@@ -114,7 +124,13 @@ def _store_opacities(S, n, frame, edge, keep, depths, at):  # type: ignore[no-un
 
 @inline
 def _composite_rgb_row(state, S, base, at, a, b, tmin, rank, color, net):  # type: ignore[no-untyped-def]
-    """For three channels: composite a primitive onto a row of pixels: add alpha T colour, update transmittance T."""
+    """For three channels: composite a primitive onto a row of pixels: add alpha T colour, update transmittance T.
+
+    ``state`` has the tile's pixel arrays, in which the row begins at ``base``. Pixels ``a`` to ``b`` - 1 are inside the
+    silhouette; pixel k of the row is lane ``at`` + k of ``S``. Pixels with T < ``tmin`` do not change. ``rank``, 1 +
+    the primitive's position in the tile's list, is stored in LAST where alpha > 0. With a ``net`` (colour network),
+    RAY_COLOUR replaces ``color``.
+    """
     a, b = f(a), f(b)
     c0, c1, c2 = color[0], color[1], color[2]
     for k in range(P.TILE):
@@ -135,7 +151,7 @@ def _composite_rgb_row(state, S, base, at, a, b, tmin, rank, color, net):  # typ
 
 @inline
 def _composite_row(state, S, base, at, a, b, tmin, rank, w):  # type: ignore[no-untyped-def]
-    """Composite a primitive onto a row of pixels, without colours: update transmittance T, fill ``w`` = alpha T."""
+    """Like :func:`_composite_rgb_row`, without colours: update transmittance T, fill the weights ``w`` = alpha T."""
     a, b = f(a), f(b)
     st, lanes = state[base:], S[L.ALPHA + at :]
     for k in range(P.TILE):
@@ -150,7 +166,7 @@ def _composite_row(state, S, base, at, a, b, tmin, rank, w):  # type: ignore[no-
 
 @inline
 def _add_colours(state, S, base, at, w, color, net):  # type: ignore[no-untyped-def]
-    """For a row of pixels and any number of channels: add ``w`` times ``color``, or with a ``net`` times RAY_COLOUR."""
+    """Add ``w`` times ``color``, or with a ``net`` times RAY_COLOUR, to a row of pixels; any number of channels."""
     for c in range(color.shape[0]):
         st = state[L.COLOR + c * P.PIXELS + base :]
         if net is None:
@@ -165,7 +181,7 @@ def _add_colours(state, S, base, at, w, color, net):  # type: ignore[no-untyped-
 
 @inline
 def _fill_background(tx, ty, down, wide_row, image):  # type: ignore[no-untyped-def]
-    """Fill the pixels of a tile that no primitive reaches with the background."""
+    """Fill a tile without primitives with the background; it has ``down`` rows of ``wide_row`` pixels from (tx, ty)."""
     for y in range(down):
         Y = index(ty + y)
         for x in range(wide_row):
@@ -179,7 +195,7 @@ def _fill_background(tx, ty, down, wide_row, image):  # type: ignore[no-untyped-
 
 @inline
 def _store_tile(state, tx, ty, down, wide_row, image):  # type: ignore[no-untyped-def]
-    """Write a tile's pixels, composited over the background, to the image."""
+    """Write a tile's pixels, composited over the background, to the image; arguments as in :func:`_fill_background`."""
     rgb, transmittance, zsum, last, background, with_depth = image
     for y in range(down):
         Y, j = index(ty + y), y * P.TILE
@@ -199,14 +215,16 @@ def _store_tile(state, tx, ty, down, wide_row, image):  # type: ignore[no-untype
 
 @kernel
 def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, edge):  # type: ignore[no-untyped-def]
-    """Render tiles ``start:stop``; return the number of evaluated lanes and, unless ``live`` is empty, their depths.
+    """Render tiles ``start:stop``; return the number of evaluated lanes, and an array with the lanes' optical depths.
 
-    A lane is one pixel of a (tile, primitive) pair, its depth an optical depth. If the frame has the tiles of several
-    images, one image after the other, ``live`` must be empty.
+    A lane is one pixel of a (tile, primitive) pair. If the frame has the tiles of several images, one image after the
+    other, ``live`` must be empty.
 
     Args:
         frame: :class:`~neuprim.core.render.cpu.tiles.FrameArrays`.
         colors: (N, C) colours, or the constants that colour networks add to.
+        image: :class:`TileImage`, filled.
+        live, first_lane: filled, see :class:`SavedForBackward`. If they are empty, the returned array is empty, too.
         net: :class:`~neuprim.core.render.cpu.colour_net.ColourNet`; None compiles a kernel without networks.
         edge: one of :data:`~neuprim.core.render.cpu.chord.EDGE_TYPES`.
     """

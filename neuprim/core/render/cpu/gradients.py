@@ -1,8 +1,8 @@
 """Compute the gradients of a (tile, primitive) pair from those of its lanes (pixels), for both orders of compositing.
 
-A lane's gradient is dL/d(2 FIELD HALF FADE), the gradient by its density integral. :func:`neuron_gradients` and
-:func:`chord_gradient` read stored chords, as needed for float64, colour networks and many neurons.
-:func:`gradients_at_once` keeps each chord in registers, for at most two neurons.
+A lane's gradient is dL/d(2 FIELD HALF FADE), the gradient by its density integral: mean density, half chord and mean
+edge weight. :func:`neuron_gradients` and :func:`chord_gradient` read stored chords, as needed for float64, colour
+networks and many neurons. :func:`gradients_at_once` keeps each chord in registers, for at most two neurons.
 """
 
 from __future__ import annotations
@@ -44,8 +44,9 @@ def _load_neuron(p, o):  # type: ignore[no-untyped-def]
 def _neuron_products(slopes):  # type: ignore[no-untyped-def]
     """Return a function that computes cos B, d(cos B)/d phase and cos dB/d rate of two neurons, B their chord profile.
 
-    B is the factor by which a neuron's mean over a chord is smaller than its value at the middle. ``slopes`` computes B
-    and dB/d rate. The function's argument q is the chord middle, its v the half chord.
+    cos is that of the phase at the chord's middle. B is the factor from the value at the middle to the mean over the
+    chord. ``slopes`` computes B and dB/d rate. The function's argument q is the chord middle, its v the half chord as a
+    vector. ``first`` and ``second`` are results of :func:`_load_neuron`.
     """
 
     @inline
@@ -70,9 +71,10 @@ _slow, _medium, _fast = _neuron_products(slopes_slow), _neuron_products(slopes_m
 
 @inline
 def _add_neuron_gradient(sums, cosine, u, v, qx, qy, qz, vx, vy, vz):  # type: ignore[no-untyped-def]
-    """Return ``sums`` plus a lane's dL/d(amplitude, phase, W) of a neuron, without the factor amplitude.
+    """Return ``sums`` plus a lane's dL/d(amplitude, phase, W) of a neuron, the last two without the factor amplitude.
 
-    ``cosine``, ``u`` and ``v`` are the results of :func:`_neuron_products` times dL/d FIELD.
+    ``cosine``, ``u`` and ``v`` are the results of :func:`_neuron_products` times dL/d FIELD. q is the chord's middle,
+    and (vx, vy, vz) the half chord as a vector.
     """
     s0, s1, s2, s3, s4 = sums
     return s0 + cosine, s1 + u, s2 + (u * qx + v * vx), s3 + (u * qy + v * vy), s4 + (u * qz + v * vz)
@@ -80,6 +82,7 @@ def _add_neuron_gradient(sums, cosine, u, v, qx, qy, qz, vx, vy, vz):  # type: i
 
 @inline
 def _store_neuron_gradient(sums, amplitude, m, out):  # type: ignore[no-untyped-def]
+    """Write the sums of neuron ``m``, times its ``amplitude`` where missing, into a gradient row."""
     s0, s1, s2, s3, s4 = sums
     o = P.G_NEURONS + P.PER_NEURON * m
     out[o + P.AMPLITUDE], out[o + P.PHASE] = s0, amplitude * s1
@@ -91,6 +94,7 @@ def _store_neuron_gradient(sums, amplitude, m, out):  # type: ignore[no-untyped-
 
 @inline
 def _gradients_without_neurons(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-def]
+    """Do the work of :func:`gradients_at_once` for a density without neurons, f = b2."""
     p, fx0, fy0, depth_floor = frame.rows[pair.i], pair.fx0, pair.fy0, frame.depth_floor
     row, tc, field = load_ray(p), p[P.TC], p[P.OFFSET]
     total, rays = f(0), zero_ray_sums()
@@ -112,6 +116,8 @@ def _gradients_without_neurons(S, n, frame, pair, edge, out):  # type: ignore[no
 
 
 def _gradients_of_two_neurons(products):  # type: ignore[no-untyped-def]
+    """Return a function that does the work of :func:`gradients_at_once` for two neurons, with their ``products``."""
+
     @inline
     def gradients(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-def]
         p, fx0, fy0, depth_floor = frame.rows[pair.i], pair.fx0, pair.fy0, frame.depth_floor
@@ -164,7 +170,7 @@ _with_two_fast = _gradients_of_two_neurons(_fast)
 def gradients_at_once(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-def]
     """Fill the gradient row of a (tile, primitive) pair, for at most :data:`AT_ONCE` neurons, from PIXEL and GRAD.
 
-    PIXEL and GRAD hold position and gradient of each lane (pixel of the pair).
+    PIXEL and GRAD hold position and gradient, dL/d(2 FIELD HALF FADE), of each lane (pixel of the pair).
     """
     if frame.neurons == 0:
         _gradients_without_neurons(S, n, frame, pair, edge, out)
@@ -183,10 +189,10 @@ def gradients_at_once(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-
 
 @inline
 def lanes_with_slopes(S, D, V, n, frame, pair, edge):  # type: ignore[no-untyped-def]
-    """Compute the chords of ``n`` lanes (pixels) of a (tile, primitive) pair; in float64 also ``V``.
+    """Compute the chords of ``n`` lanes (pixels) of a (tile, primitive) pair; in float64 also FIELD and ``V``.
 
-    ``V`` gets three products per neuron for its gradients. Returns True if the pair is in float64 and the near plane
-    cuts a chord.
+    ``V`` gets three products per neuron for its gradients: N_COS, N_SIN and N_DSINC. Returns True if the pair is in
+    float64 and the near plane cuts a chord.
     """
     slot = frame.slots[pair.i]
     if slot >= 0:
@@ -201,7 +207,8 @@ def lanes_with_slopes(S, D, V, n, frame, pair, edge):  # type: ignore[no-untyped
 def _chord_field_gradient(S, n, out, edge, in_float64):  # type: ignore[no-untyped-def]
     """Fill dL/d FIELD of ``n`` lanes from dL/d(2 FIELD HALF FADE); sum up dL/d b2 and the gradient by log m.
 
-    FIELD, the mean of the density network over a chord, is recovered from the optical depth, except in float64.
+    FIELD, the mean of the density network over a chord, is recovered from the optical depth, except in float64. GRAD is
+    doubled, to dL/d(FIELD HALF FADE). The gradients of chords, to which neurons add, are set to 0.
     """
     offset, log_m = f(0), f(0)
     for k in range(n):
@@ -218,10 +225,10 @@ def _chord_field_gradient(S, n, out, edge, in_float64):  # type: ignore[no-untyp
 
 
 def _two_neuron_lane_gradients(products):  # type: ignore[no-untyped-def]
-    """Return a function that computes gradients of neurons m and m + 1, dL/dQ and dL/d(half e).
+    """Return a function that writes the gradients of neurons m and m + 1, and adds to dL/dQ and dL/d(half e) of lanes.
 
-    Q is the middle of a lane's chord, and half e its half chord as a vector. If ``products`` is None, the function
-    reads cos B and its derivatives from V0 and V1; B is a neuron's chord profile.
+    Q is the middle of a lane's chord, and half e its half chord as a vector. ``products`` is from
+    :func:`_neuron_products`. If it is None, the function reads the same three values per neuron from V0 and V1.
     """
 
     @inline
@@ -267,7 +274,8 @@ _two_float64 = _two_neuron_lane_gradients(None)
 def neuron_gradients(S, V, n, p, kinds, neurons, edge, in_float64, cut, out):  # type: ignore[no-untyped-def]
     """Fill the gradients of b2, log m and every neuron of a (tile, primitive) pair, and of its lanes' chords.
 
-    The latter are dL/dQ, Q the middle of the chord, and dL/d(half e), half e the half chord as a vector.
+    The latter are dL/dQ, Q the middle of the chord, and dL/d(half e), half e the half chord as a vector. ``p`` is the
+    primitive's row, ``kinds`` its ranges of rates. ``V`` (float64 only) and ``cut`` are from :func:`lanes_with_slopes`.
     """
     _chord_field_gradient(S, n, out, edge, in_float64)
     for m in range(0, neurons, 2):
@@ -289,10 +297,10 @@ def neuron_gradients(S, V, n, p, kinds, neurons, edge, in_float64, cut, out):  #
 def chord_gradient(S, n, p, out, edge, cut):  # type: ignore[no-untyped-def]
     """Fill dL/d(E0, EX, EY, XA) of a primitive's rays from the gradients by chord middle, half chord and direction.
 
-    A hard edge has gradients through the chord's ends, t0 and t1. A soft edge has none, but its weight depends on D = 1
-    - |p|^2 at the closest point p and, if the near plane cuts the chord, on a = e.e and the closest approach tm. If no
-    chord of the pair is cut, BY_D is d FADE/dD, and the gradient through HALF is used. Otherwise (float64) the ends
-    have no gradient, and BY_D, BY_A and BY_TM are derivatives of the whole mean FADE FIELD.
+    With a hard edge, gradients flow through the chord's ends. A soft edge adds the gradient of its weight through D = 1
+    - |p|^2 at the closest point p. If no chord of the pair is cut by the near plane, BY_D is d FADE/dD. If one is
+    ``cut`` (float64), the density is zero at the ends or the end is fixed, so ends have no gradient. Instead, BY_D,
+    BY_A and BY_TM are the derivatives of FADE FIELD by D, a = e.e and the closest approach tm.
     """
     tc, soft = p[P.TC], len(edge)
     rays = zero_ray_sums()

@@ -1,8 +1,9 @@
 """Project primitives to the screen, in float64: anchor pixels, rays in whitened space, exact screen bounds.
 
-In whitened space (units of the semi-axes), a primitive is the unit sphere. The anchor of a primitive is its projected
-centre. Whitened rays are affine in the pixel offset from the anchor, so float32 need not represent the distance to the
-camera (method: "Line integral"). Neither the anchor nor m, the unit of the ray parameter t, has a gradient.
+In whitened space (units of the semi-axes), a primitive is the unit ball. The anchor pixel of a primitive shows its
+centre. A primitive near or behind the camera is anchored at the camera instead. Whitened rays are affine in the pixel
+offset from the anchor, so float32 need not represent the distance to the camera. The ray parameter t has the unit m,
+the longest semi-axis. Images do not depend on anchor and unit, so the backward pass treats both as constants.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ class PrimitiveArrays(NamedTuple):
 class View(NamedTuple):
     """A camera: world-to-camera rotation R and translation t, intrinsics and size in pixels, depth of the near plane.
 
-    ``turns`` is omega0 / 2 pi, the density's factor from phases to turns.
+    Kernels count phases in turns of 2 pi. ``turns`` = omega0 / 2 pi is the density's factor from W1 and b1 to turns.
     """
 
     R: Array
@@ -107,9 +108,10 @@ class Projected(NamedTuple):
 
 @strict
 def _is_too_faint_to_draw(most, edge, least):  # type: ignore[no-untyped-def]
-    """Return whether no chord through a primitive, wherever it is, can reach the optical depth ``least``.
+    """Return whether no chord through a primitive, from any camera, can reach the optical depth ``least``.
 
-    ``most`` bounds density times m, and half chords are at most m, the longest semi-axis.
+    ``most`` = b2 + sum |w2| bounds density times m, the longest semi-axis. Half chords are at most m, so the optical
+    depth is at most ``most`` N_p. N_p is the integral of the edge weight of exponent p = ``edge``.
     """
     return most <= 0.0 or most * NORMS[edge] <= least
 
@@ -118,8 +120,9 @@ def _is_too_faint_to_draw(most, edge, least):  # type: ignore[no-untyped-def]
 def _visible_square(most, longest, edge, least):  # type: ignore[no-untyped-def]
     """Return r^2, where only rays through the ellipsoid scaled by r can reach the optical depth ``least``.
 
-    r^2 is 1 for the whole ellipsoid and 0 if no ray can. ``most`` is b2 + sum |w2|, and ``longest`` bounds half chords
-    in units of the longest semi-axis. The result is rounded to float32, so that backends agree.
+    r^2 = 1 - (least / (most N_p longest))^(1/(p + 1/2)) with p = ``edge``, see :mod:`neuprim.core.render.layout`. It is
+    1 for the whole ellipsoid and 0 if no ray can. ``most`` is b2 + sum |w2|, and ``longest`` bounds half chords in
+    units of the longest semi-axis. The result is rounded to float32, so that backends agree.
     """
     share = least / (most * NORMS[edge] * longest)
     if share >= 1.0:
@@ -145,13 +148,14 @@ def _is_finite_undrawn_primitive(i, parameters, most):  # type: ignore[no-untype
 
 @strict
 def _silhouette_screen_extent(z, ci, s22, square, b, axes, towards, focal, middle):  # type: ignore[no-untyped-def]
-    """Return the pixel range along a screen axis of the silhouette of an ellipsoid, scaled by ``square`` ** 0.5.
+    """Return the first and last pixel coordinate, along one screen axis, of an ellipsoid's silhouette.
 
-    The range lies between the tangents to the silhouette, as in ``screen_boxes`` of the float64 reference renderer.
-    Lengths are in units of the ellipsoid's longest semi-axis. ``z`` and ``ci`` are the centre's camera coordinates in
-    depth and along the screen axis, ``axes`` are the semi-axes, ``middle`` is the principal point. ``b`` and
-    ``towards`` are the rows of the orientation matrix, in camera axes, for the screen axis and for depth. ``s22`` is
-    the variance in depth of the unscaled ellipsoid's matrix B diag(s^2) B^T.
+    The ellipsoid is scaled by ``square`` ** 0.5. The range lies between the tangents to the silhouette, as in
+    ``screen_boxes`` of the float64 reference renderer. Lengths are in units of the ellipsoid's longest semi-axis. ``z``
+    and ``ci`` are the centre's camera coordinates in depth and along the screen axis. ``axes`` are the semi-axes,
+    ``focal`` and ``middle`` focal length and principal point in pixels. ``b`` and ``towards`` are the rows of the
+    orientation matrix B, in camera axes, for the screen axis and for depth. ``s22`` is the (z, z) entry of B diag(s^2)
+    B^T, unscaled.
     """
     (b0, b1, b2), (s0, s1, s2), (d0, d1, d2), szz = b, axes, towards, square * s22
     sii = square * ((b0 * s0) ** 2 + (b1 * s1) ** 2 + (b2 * s2) ** 2)
@@ -165,8 +169,10 @@ def _silhouette_screen_extent(z, ci, s22, square, b, axes, towards, focal, middl
 def _longest_half_chord(c, m, reach, tc, fx, fy, e_length, ex_length, ey_length):  # type: ignore[no-untyped-def]
     """Return an upper bound, <= 1, of the half chords of all rays, in units of the longest semi-axis m.
 
-    A ray of direction e through the centre has half chord m / |e|. No point is farther than m from the centre, which
-    bounds the slopes of the rays. The bound is 1 where the anchor is not the centre.
+    A direction d with camera-z 1 is e in whitened space, and its half chord is at most m |d|/|e|. No point is farther
+    than m from the centre, which bounds the slopes of the rays, |d| and |e|. The bound is 1 where the anchor is not the
+    centre (``tc`` is 0). ``c`` is the centre in camera axes, ``reach`` half the ellipsoid's extent in depth. The last
+    three arguments are the lengths of e at the anchor and of its changes per pixel.
     """
     u, v, wide = abs(c[0] / c[2]), abs(c[1] / c[2]), m / (c[2] - reach)
     du, dv = wide * (1.0 + u), wide * (1.0 + v)
@@ -197,7 +203,12 @@ def _rounded(x):  # type: ignore[no-untyped-def]
 
 @strict
 def _bound_block(S, view, edge, least):  # type: ignore[no-untyped-def]
-    """Fill silhouettes, pixel boxes and status of a block of primitives, and whether each needs float64."""
+    """Fill silhouettes, pixel boxes and status of a block of primitives, and whether each needs float64.
+
+    ``S`` is a block (32 primitives) with the columns of :func:`fill_block` and MOST. ``edge`` is the exponent p,
+    ``least`` the lowest optical depth that is drawn. Rays of primitives in float64 do not slide, so their TU, TV, XU
+    and XV are replaced.
+    """
     fx, fy, cx, cy, near = view.fx, view.fy, view.cx, view.cy, view.near
     width, height, soft = float(view.width), float(view.height), edge > 0
     for k in range(BLOCK):
@@ -284,7 +295,7 @@ def _bound_block(S, view, edge, least):  # type: ignore[no-untyped-def]
 
 @exact_kernel
 def prepare_wide(start, stop, which, parameters, view, order, wide):  # type: ignore[no-untyped-def]
-    """Fill the float64 rows of primitives ``which[start:stop]``, whose pixels are computed in float64."""
+    """Fill ``wide[n]`` for n in ``start:stop``: the float64 row of primitive ``which[n]``, drawn in float64."""
     parameters, view, own = borrow_arrays(parameters), borrow_arrays(view), allocate_block(parameters.W1.shape[1])
     S, waves, rate, block = borrow_arrays(own)
     for first in range(start, stop, BLOCK):
@@ -320,7 +331,8 @@ def _store_block(block, n, S, waves, rate, out):  # type: ignore[no-untyped-def]
 def prepare_primitives(start, stop, parameters, view, edge, least, out):  # type: ignore[no-untyped-def]
     """Project primitives ``start:stop``; fill ``out``. Silhouettes contain all rays that reach optical depth ``least``.
 
-    A primitive that is too faint for any ray to reach that depth gets only a status, an empty box and a depth of 0.
+    ``edge`` is the exponent p. A primitive that is too faint for any ray to reach that depth gets only a status, an
+    empty box and a depth of 0.
     """
     parameters, view, out = borrow_arrays(parameters), borrow_arrays(view), borrow_arrays(out)
     w2, b2, boxes = parameters.w2, parameters.b2, out.boxes

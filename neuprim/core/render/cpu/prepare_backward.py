@@ -46,7 +46,8 @@ def _axis_gradient(b, s, g, reference, w, fx, fy):  # type: ignore[no-untyped-de
     """Return dL/d(column of B), dL/d(log semi-axis s) and the part of -m dL/d(centre) for one axis of an ellipsoid.
 
     B is the orientation in camera axes. ``g`` is dL/d(E0, EX, EY, XA), the numbers of the rays, along this axis; ``b``
-    is the axis's column of B, and ``s`` its length over m.
+    is the axis's column of B, and ``s`` its length over m. ``reference`` is the anchor on the image plane z = 1, ``w``
+    the vector from the centre to the anchor, over m.
     """
     a = b[0] / s, b[1] / s, b[2] / s
     gx = g[3]
@@ -58,7 +59,7 @@ def _axis_gradient(b, s, g, reference, w, fx, fy):  # type: ignore[no-untyped-de
 
 @strict
 def _rays_backward(S, view):  # type: ignore[no-untyped-def]
-    """Fill dL/d(orientation B, log scales, centre) of a block of primitives from the gradients by its rays."""
+    """Fill dL/d(orientation B, log scales, centre in camera axes) of a block from the gradients by its rays."""
     fx, fy, cx, cy = view.fx, view.fy, view.cx, view.cy
     for k in range(BLOCK):
         m, c, s = S[M + k], load3(S, CENTRE, k), load3(S, AXES, k)
@@ -83,7 +84,7 @@ def _rays_backward(S, view):  # type: ignore[no-untyped-def]
 def _neuron_backward(S, turns):  # type: ignore[no-untyped-def]
     """Fill dL/dW1 of one neuron of a block of primitives; add its part of dL/d(log scales, LOCAL, log m).
 
-    LOCAL is the orientation in scene axes, m the longest semi-axis.
+    LOCAL is the orientation in scene axes, m the longest semi-axis. ``turns`` is omega0 / 2 pi.
     """
     for k in range(BLOCK):
         wave, W, g, s = load3(S, _WAVE, k), load3(S, _WEIGHT, k), load3(S, _G_WAVE, k), load3(S, AXES, k)
@@ -106,7 +107,8 @@ def _neuron_backward(S, turns):  # type: ignore[no-untyped-def]
 def _geometry_backward(S, R):  # type: ignore[no-untyped-def]
     """Fill dL/d(means, log scales, quaternions) of a block of primitives, whose other gradients are complete.
 
-    These are the gradients by B and LOCAL (orientation in camera and scene axes), log m and the centre.
+    These are the gradients by B and LOCAL (orientation in camera and scene axes), log m and the centre in camera axes.
+    R is the camera's rotation.
     """
     x, y, z = (R[0, 0], R[1, 0], R[2, 0]), (R[0, 1], R[1, 1], R[2, 1]), (R[0, 2], R[1, 2], R[2, 2])
     for k in range(BLOCK):
@@ -142,7 +144,7 @@ def _geometry_backward(S, R):  # type: ignore[no-untyped-def]
 
 @strict
 def _backward_block(which, n, parameters, view, projected, grads, out, g_view, S):  # type: ignore[no-untyped-def]
-    """Compute the parameter gradients of a block of primitives, ``which[:n]``, from their gradient rows."""
+    """Compute the gradients ``out`` and ``g_view`` of a block of primitives, ``which[:n]``, from gradient rows."""
     W1, rows, order, turns = parameters.W1, projected.rows, projected.order, view.turns
     load_block(which, n, parameters, S)
     project_block(S, view)

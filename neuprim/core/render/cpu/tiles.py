@@ -1,8 +1,8 @@
 """Tiles of 16 x 16 pixels: which primitives reach each tile, front to back, and which pixels of it each one covers.
 
-Forward and backward pass do the same per (tile, primitive) pair: find the pixels of each row inside the silhouette,
-gather them into a compact list of lanes (one per pixel), compute chords and neurons of all lanes, scatter the results
-back row by row.
+Forward and backward pass do the same per (tile, primitive) pair. They find the pixels of each row inside the
+silhouette, and gather them into a compact list of lanes (one per pixel). They compute chords and neurons of all lanes,
+and write the results back row by row.
 """
 
 from __future__ import annotations
@@ -43,7 +43,10 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class TileLists:
-    """Pairs (tile, primitive) of a frame, sorted by tile, then by depth."""
+    """Pairs (tile, primitive) of a frame, sorted by tile, then by the depth of the primitive's centre.
+
+    The pairs of primitive i have the indices ``slots[first[i] : first[i + 1]]``.
+    """
 
     starts: NDArray[np.int64]  # (tiles + 1,) first pair of each tile
     ids: NDArray[np.int32]  # (pairs,) primitive of each pair
@@ -59,7 +62,7 @@ def depth_order(depth: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the indices that sort primitives front to back by ``depth``; equal depths stay in index order.
 
     Sorts unique integer keys (depth bits above, index below), many times faster than a stable float argsort. With 1
-    million primitives, depths that agree to about 1e-9 of their value count as equal.
+    million primitives, depths that agree to about 2e-10 of their value count as equal.
     """
     count = depth.shape[0]
     bits = max(int(count - 1).bit_length(), 1)
@@ -74,8 +77,8 @@ def depth_order(depth: NDArray[np.float64]) -> NDArray[np.int64]:
 def _reached_tiles(start, stop, projected, across, first):  # type: ignore[no-untyped-def]
     """Return the tiles that the silhouettes of primitives ``start:stop`` reach, with a margin of 1e-3 pixels.
 
-    The tiles of each primitive follow each other, in the order of primitive indices. ``first[i + 1]`` gets the number
-    of tiles of primitive i.
+    The result is int32: tile numbers, counted row by row with ``across`` tiles per row. Those of one primitive follow
+    each other, in the order of primitive indices. ``first[i + 1]`` gets the number of tiles of primitive i.
     """
     rows, spans, boxes, status = projected.rows, projected.spans, projected.boxes, projected.status
     tiles, n = np.empty(4096, np.int32), 0
@@ -118,7 +121,8 @@ def _reached_tiles(start, stop, projected, across, first):  # type: ignore[no-un
 def _sort_pairs_by_tile(order, first, tiles, starts, ids, slots):  # type: ignore[no-untyped-def]
     """Sort (tile, primitive) pairs by tile, with a counting sort, so that each tile's list is front to back.
 
-    ``order`` has the primitives from front to back. Fills ``starts``, ``ids`` and ``slots`` of :class:`TileLists`.
+    ``order`` has the primitives from front to back. Primitive i reaches the tiles ``tiles[first[i] : first[i + 1]]``.
+    Fills ``starts`` (given as zeros), ``ids`` and ``slots`` of :class:`TileLists`.
     """
     for k in range(tiles.shape[0]):
         starts[tiles[k] + 1] += 1
@@ -137,9 +141,10 @@ def _sort_pairs_by_tile(order, first, tiles, starts, ids, slots):  # type: ignor
 def bin_primitives(
     projected: Projected, width: int, height: int, threads: int, images: tuple[Array, int] | None = None
 ) -> TileLists:
-    """Return the tile lists of a frame.
+    """Return the (tile, primitive) pairs of a frame; an image has ``width`` x ``height`` pixels.
 
-    ``images`` holds each primitive's image index, (N,), and the number of images; None means one image.
+    ``images`` holds each primitive's image index, (N,), and the number of images; None means one image. The tiles of
+    several images are numbered image by image.
     """
     count = projected.depth.shape[0]
     across, down = -(-width // P.TILE), -(-height // P.TILE)
@@ -178,9 +183,10 @@ class FrameArrays(NamedTuple):
 
 
 class PairWindow(NamedTuple):
-    """The pixels of a tile with corner (tx, ty) in primitive i's box: columns x0:x1 and rows y0:y1 of the tile.
+    """The pixels of one tile that lie in the pixel box of primitive ``i``: columns x0:x1 and rows y0:y1 of the tile.
 
-    (fx0, fy0) is the offset of the tile's first pixel centre from the primitive's anchor.
+    (tx, ty) is the tile's first pixel. (fx0, fy0) is the offset of this pixel's centre from the primitive's anchor
+    pixel, which shows its centre.
     """
 
     i: int
@@ -196,6 +202,7 @@ class PairWindow(NamedTuple):
 
 @inline
 def pair_window(frame, i, tx, ty):  # type: ignore[no-untyped-def]
+    """Return the :class:`PairWindow` of primitive ``i`` in the tile whose first pixel is (tx, ty)."""
     box, p = frame.boxes[i], frame.rows[i]
     return PairWindow(
         i, tx, ty, max(box[0] - tx, 0), min(box[2] - tx, P.TILE), max(box[1] - ty, 0), min(box[3] - ty, P.TILE),
@@ -221,7 +228,7 @@ def aligned_tile_zeros(floats):  # type: ignore[no-untyped-def]
 
 
 def _emit_prefetch(context, address):  # type: ignore[no-untyped-def]
-    """Generate code that prefetches the cache line at an address. Nothing is read, so any address is allowed."""
+    """Define the intrinsic ``_prefetch(address)`` of a cache line. Nothing is read, so any address is allowed."""
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         byte, i32 = ir.IntType(8).as_pointer(), ir.IntType(32)
@@ -257,7 +264,12 @@ def prefetch_lane_depths(depths, first, stop):  # type: ignore[no-untyped-def]
 
 @inline
 def row_spans(span, pair, rows_live, bounds):  # type: ignore[no-untyped-def]
-    """Find, for each unfinished row y of a tile, its pixels [bounds[y], bounds[y + 16]) inside the silhouette."""
+    """Find the pixels ``bounds[y]`` to ``bounds[y + 16]`` - 1 of each tile row y that are inside a silhouette.
+
+    ``span`` is the primitive's silhouette (columns SKEW to HY), ``pair`` a :class:`PairWindow`. Rows with a
+    ``rows_live`` of 0, whose pixels are all finished, are empty. Because of a margin for rounding, a few pixels may be
+    outside.
+    """
     skew, xc, yc, hx = span[P.SKEW], span[P.XC] - pair.fx0, span[P.YC] - pair.fy0, span[P.HX]
     ihy = f(1) / span[P.HY]
     low, high, top, bottom = f(pair.x0), f(pair.x1), f(pair.y0), f(pair.y1)
@@ -278,10 +290,12 @@ def row_spans(span, pair, rows_live, bounds):  # type: ignore[no-untyped-def]
 
 @inline
 def compact_lanes(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-def]
-    """Gather the pixels inside a silhouette, and their ray norms, into lanes; return the number of lanes.
+    """Gather the pixels inside a silhouette into lanes: fill PIXEL and NORM_L; return the number of lanes.
 
-    Row y of the tile starts at lane ``offset[y]``. Padding is the first lane's pixel with a norm of 0. Every row copies
-    a whole vector without a branch; the next row, or the padding, overwrites the excess.
+    ``bounds`` has the pixels of each tile row, from :func:`row_spans`. Row y of the tile starts at lane ``offset[y]``.
+    NORM_L is the length of the pixel's ray direction whose camera-z is 1, from ``state``. Behind the last lane follow
+    16 padding lanes with the first lane's pixel and a NORM_L of 0. Every row copies a whole vector without a branch;
+    the next row, or the padding, overwrites the excess.
     """
     n = 0
     for y in range(y0, y1):
@@ -302,8 +316,9 @@ def compact_lanes(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-
 def lane_chords(S, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
     """Compute the chords (rays inside the primitive) of n lanes (pixels): middle Q, direction E, half length HALF.
 
-    HALF is 0 where the ray misses. The near plane must not cut a soft-edged chord: such primitives are drawn in
-    float64.
+    Q and E are in whitened space, where the primitive is the unit ball. HALF is 0 where the ray misses. FIELD is set to
+    b2 and FADE to the mean edge weight. ``with_mid`` adds MID for the depth image, and ``backward`` what gradients
+    need. The near plane must not cut a soft-edged chord: such primitives are drawn in float64.
     """
     p, fx0, fy0, depth_floor = frame.rows[pair.i], pair.fx0, pair.fy0, frame.depth_floor
     row, offset = load_ray(p), p[P.OFFSET]
@@ -332,7 +347,11 @@ def lane_chords(S, n, frame, pair, with_mid, backward, edge):  # type: ignore[no
 
 
 def _neuron_values(profiles):  # type: ignore[no-untyped-def]
-    """Return a function that adds w2 cos(phase at middle) B_p(rate x half chord), two neurons' means, to FIELD."""
+    """Return a function that adds w2 cos(phase at middle) B_p(rate x half chord), two neurons' means, to FIELD.
+
+    B_p is the profile of :mod:`~neuprim.core.render.cpu.chord`, which ``profiles`` computes for both. In the function,
+    ``p`` is the primitive's row, and the first neuron begins at column ``o``.
+    """
 
     @inline
     def add(S, n, p, o, edge):  # type: ignore[no-untyped-def]
@@ -364,7 +383,8 @@ _values_fast = _neuron_values(profiles_fast)
 def chord_field_values(S, D, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
     """Compute chords of ``n`` lanes (pixels) and FIELD, the mean of the density network over each chord.
 
-    Uses float64 if the primitive needs it. For the arguments see :func:`lane_chords`.
+    The mean is weighted by the edge weight (1 - |y|^2)^p. If the primitive needs float64, ``D`` gets the float64
+    chords. For the other arguments see :func:`lane_chords`.
     """
     i = pair.i
     if frame.slots[i] >= 0:

@@ -1,4 +1,7 @@
-"""The cuda backend, in Warp. Projects primitives in float64; computes pixels in float32.
+"""The cuda backend: render primitives by GPU kernels in NVIDIA Warp, with hand-written gradients.
 
-For tests, the same source runs on the CPU, as Warp's CPU blocks.
+A frame runs through ``prepare`` (project primitives), ``binning`` (list the primitives of each tile), ``slots`` (list
+the pixels of each (tile, primitive) pair) and ``forward`` (composite). ``backward`` and ``prepare_backward`` compute
+gradients. Primitives are projected in float64 and pixels computed in float32, or in ``float64`` where needed. For
+tests, the same source runs on the CPU.
 """

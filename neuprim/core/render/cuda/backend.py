@@ -1,4 +1,4 @@
-"""The cuda backend as one differentiable operation, on the device of its tensors and torch's current stream."""
+"""Render a frame by the cuda backend as one autograd operation, on its tensors' device and torch's current stream."""
 
 from __future__ import annotations
 
@@ -76,7 +76,8 @@ class _Rasterize(torch.autograd.Function):
         net: ColourNet | None = ctx.net
         if drawn is None:
             raise RuntimeError(
-                "the cuda backend's backward pass frees what the forward pass saved: it runs once per frame"
+                "the cuda backend's backward pass frees what the forward pass saved: it runs once per frame. "
+                "Render the frame again before another backward pass"
             )
         ctx.drawn = None
         device, pixels = frame.device, drawn.transmittance.shape[0]
@@ -115,22 +116,30 @@ def render(
     settings: RenderSettings,
     capacity: FrameCapacity | None = None,
 ) -> RenderOutput:
-    """Render a frame; see :data:`neuprim.core.render.output.Draw`. With a ``capacity`` the host never waits.
+    """Render a frame; see :data:`neuprim.core.render.output.Draw` for arguments and result.
 
-    Then colours must be :class:`Constant`, and the statistics contain sizes of arrays instead of counts.
+    ``capacity`` fixes the sizes of the frame's arrays, so that the host never waits for the GPU. Then colours must be
+    :class:`Constant`, and the statistics contain these sizes instead of counts.
     """
     return rasterize(_Rasterize, "cuda", lowered, camera, background, settings, capacity)
 
 
 def frame_counts(stats: RenderStats) -> tuple[int, int, int, int]:
-    """Return the counts of a differentiable frame without capacity, in the order of :class:`FrameCapacity`."""
+    """Return the counts of a differentiable frame without capacity, in the order of :class:`FrameCapacity`.
+
+    They count (tile, primitive) pairs, primitives in float64, slots (pixels of all pairs), and pairs in float64.
+    """
     return stats.pairs, stats.extra["float64"], stats.extra["hits"], stats.extra["float64_pairs"]
 
 
 def render_slabs(
     lowered: LoweredPrimitives, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
-    """Render all slabs (groups of primitives) as one frame; see :func:`neuprim.core.render.render_slabs`."""
+    """Render each slab (group of primitives) to an image of its own, all in one frame, without gradients.
+
+    Return (count, H, W) opacities and mean depths; an empty slab has opacity 0. ``slabs`` (N,) has the slab of each
+    primitive, 0 to ``count`` - 1. See :func:`neuprim.core.render.render_slabs`.
+    """
     means, settings = lowered.geometry.means, replace(settings, depth=True)
     tensors = rasterizer_tensors(lowered)
     blank = torch.zeros(len(means), 1, device=means.device)

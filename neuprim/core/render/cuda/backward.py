@@ -1,11 +1,15 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Backward pass of compositing. A slot holds the data that the forward pass saved for one pixel of a pair.
+"""Backward pass of compositing: compute gradients of the primitives' rows from the gradient of the image.
 
-First kernel, one block per tile, one thread per pixel: visit the hits (primitives on the pixel's ray) back to front,
-and store dL/dI, I the optical depth, and the weight in each slot. Second kernel, one warp per (tile, primitive) pair:
-recompute chord and neurons, sum in registers, and write one gradient row. A primitive's rows are added in the order of
-its pairs, so reruns give the same bits. With 8 neurons the sums take 59 of 128 registers, so the kernel recomputes
-cheap values instead of keeping them in registers.
+A pair is a tile and a primitive that reaches it. A slot holds what the forward pass saved for one pixel of a pair. A
+hit is a slot whose primitive lies on the pixel's ray.
+
+1. First kernel, one block per tile, one thread per pixel: visit the hits back to front. Store dL/dI, I the optical
+   depth, and the weight alpha T in each slot.
+2. Second kernel, one warp per pair: recompute chords and neurons, sum in registers, and write one gradient row.
+3. Add each primitive's rows in the order of its pairs, so reruns give the same bits.
+
+With 8 neurons the sums take 59 of 128 registers, so the second kernel recomputes cheap values instead of keeping them.
 """
 
 from __future__ import annotations
@@ -72,7 +76,7 @@ from neuprim.core.settings import RenderSettings
 
 @functools.cache
 def pixels_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return the first backward kernel, one thread per pixel; with ``depth``, the depth image has a gradient, too."""
+    """Return the kernel that computes dL/dI of hits, one thread per pixel; ``depth``: depth images have a gradient."""
     C, H = form.channels, form.hidden
     colours, width = L.rasterizer_colour_column(form.neurons), L.rasterizer_row_columns(form.neurons, C)
     vecC = wp.types.vector(length=C, dtype=wp.float32)
@@ -83,9 +87,11 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
         transmittance: Floats, reached: Ints, background: Floats, g_rgb: Floats2d, g_transmittance: Floats, g_z: Floats,
         depths: Floats, hues: Floats2d, hits: Vec2s,
     ):  # fmt: skip
-        """Store the weight w and dL/dI = (1 - alpha) T dL/dw - b in each slot, I the optical depth of the hit.
+        """Replace (alpha, T) in each slot by (dL/dI, w): dL/dI = (1 - alpha) T dL/dw - b, with the weight w = alpha T.
 
-        b, the light behind the hit, is the sum of w dL/dw of later hits and T dL/dT.
+        I is the optical depth of the hit, T the transmittance before it. b belongs to the light behind the hit: it is
+        the sum of w dL/dw over later hits, plus T_end dL/dT_end at the end of the ray. Where alpha is clamped to
+        alpha_max, dL/dI is 0.
         """
         tile, lane = wp.tid()
         across = (size[0] + L.TILE - 1) // L.TILE
@@ -139,7 +145,7 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
 
 @functools.cache
 def pairs_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return the second backward kernel, with a warp per pair; with ``depth``, the depth image has a gradient, too."""
+    """Return the kernel for gradient rows of pairs, one warp each; ``depth``: depth images have a gradient."""
     K, P, C = form.neurons, form.edge, form.channels
     W, width = L.rasterizer_row_columns(K, C), L.gradient_width(K, C)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)
@@ -350,9 +356,9 @@ def uncomposite_kernel(form: KernelForm, depth: bool) -> Any:
 
 @dataclass
 class ImageGradient:
-    """The gradient of the loss by the image, float32 and contiguous, and an error per pixel.
+    """Gradient of the loss with respect to the image, and an error per pixel; float32 and contiguous.
 
-    The backward pass adds up the errors that each primitive contributes to; population control uses these sums.
+    The backward pass sums weight x error over each primitive's pixels. Population control uses these sums.
     """
 
     rgb: Tensor  # (H W, C)
@@ -370,9 +376,9 @@ def rasterizer_gradient_rows(
     settings: RenderSettings,
     gradient: ImageGradient,
 ) -> tuple[Tensor, Tensor | None]:
-    """Return gradient rows of primitives, (N, gradient_width), and of networks, (N, net_gradient_row_width) or None.
+    """Return the gradient rows of N primitives, (N, gradient_width), and those of their colour networks.
 
-    Overwrites the slots, in which the forward pass saved its data.
+    The latter are (N, net_gradient_row_width), or None without networks. Overwrites ``drawn.hits``, the saved slots.
     """
     lists, device, depth = frame.lists, frame.device, gradient.z is not None
     pairs, tiles = lists.pairs, lists.starts.shape[0] - 1

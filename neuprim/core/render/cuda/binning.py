@@ -1,7 +1,7 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Silhouettes, lists of primitives per tile, counts; the CUDA version of :mod:`neuprim.core.render.cpu.tiles`.
+"""List the primitives that reach each tile, by their silhouettes; CUDA version of :mod:`neuprim.core.render.cpu.tiles`.
 
-Outputs are counted before they are written, and sorted by integer keys, so reruns give the same bits. The host waits
+Entries are counted before they are written, and sorted by integer keys, so reruns give the same bits. The host waits
 once for the counts, unless the caller gives the sizes of the arrays (:class:`FrameCapacity`).
 """
 
@@ -50,9 +50,9 @@ _MARGIN, _SPARE = 1.5, 256  # factor and addend from counts to the sizes of arra
 
 @dataclass(frozen=True)
 class FrameCapacity:
-    """Fixed sizes of a frame's arrays, with which the host need not wait for the frame's counts.
+    """Fixed sizes of a frame's arrays, so that the host need not wait for the frame's counts.
 
-    A frame that does not fit, or has a primitive that is not finite, is drawn empty and sets ``refused``.
+    A frame that does not fit, or has a primitive that is not finite, is drawn empty and sets ``refused`` to 1.
     """
 
     pairs: int  # (tile, primitive) pairs
@@ -65,9 +65,9 @@ class FrameCapacity:
     def around(
         cls, counts: Sequence[int], refused: Tensor, zeros: bool, least: "FrameCapacity | None" = None
     ) -> "FrameCapacity":
-        """Return sizes with room beyond ``counts``, in the order of the fields, and no smaller than those of ``least``.
+        """Return 1.5 x ``counts`` + 256, in the order of the fields, or the sizes of ``least`` where these are larger.
 
-        With ``zeros``, a count of 0 gets no room.
+        With ``zeros``, a count of 0 gets the size 0.
         """
         sizes = [0 if zeros and not count else int(_MARGIN * count) + _SPARE for count in counts]
         if least is not None:
@@ -123,9 +123,10 @@ def running_sums(counts: Tensor) -> Tensor:
 
 
 def count_tiles(counts: Tensor, bad: Tensor, capacity: FrameCapacity | None = None) -> TileCounts:
-    """Return the sizes of a frame's arrays, and running sums of ``counts`` (2, N): tiles and float64 primitives.
+    """Return the sizes of a frame's arrays from ``counts`` (2, N): tiles reached, and 1 for primitives in float64.
 
-    Waits for the device if there is no ``capacity``. Raises BackendUnavailable if there are too many pairs.
+    ``bad`` (1,) is the first primitive that is not finite, or N. Waits for the device if there is no ``capacity``.
+    Raises BackendUnavailable if there are too many pairs.
     """
     ends = running_sums(counts)
     if capacity is not None:
@@ -143,13 +144,16 @@ def count_tiles(counts: Tensor, bad: Tensor, capacity: FrameCapacity | None = No
 
 @wp.func
 def projected_covariance(p: ProjectedPrimitive, i: int, j: int):
-    """Return entry (i, j) of an ellipsoid's matrix B diag(s^2) B^T in camera axes, in units of m^2; s: semi-axes."""
+    """Return entry (i, j) of B diag(s^2) B^T / m^2; B: orientation in camera axes, s: semi-axes, m: the longest one."""
     return wp.dot(wp.cw_mul(p.B[i], p.B[j]), wp.cw_mul(p.axes, p.axes))
 
 
 @wp.func
 def silhouette_screen_extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.float64, square: wp.float64):
-    """Return the pixel range along a screen axis of an ellipsoid's silhouette, after scaling it by ``square``^0.5."""
+    """Return the first and last pixel coordinate of an ellipsoid's silhouette along screen ``axis``, 0 (x) or 1 (y).
+
+    The ellipsoid is first scaled by ``square``^0.5. ``s22`` is its :func:`projected_covariance` at (2, 2).
+    """
     z, ci, szz = p.centre[2] / p.m, p.centre[axis] / p.m, square * s22
     sii, siz = square * projected_covariance(p, axis, axis), square * projected_covariance(p, axis, 2)
     D = z * z * sii - d(2.0) * ci * z * siz + ci * ci * szz - (sii * szz - siz * siz)
@@ -161,7 +165,11 @@ def silhouette_screen_extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.
 
 @wp.struct
 class SilhouetteSpans:
-    """Shape of a silhouette per pixel row (hx, hy UNBOUNDED if it is no ellipse), and whether float64 is needed."""
+    """A silhouette as a span of each pixel row, and whether the primitive needs float64 (0 or 1).
+
+    Pixel offsets are relative to the anchor pixel, which usually shows the centre. At offset dv, the span is xc +
+    skew (dv - yc) +- hx (1 - ((dv - yc)/hy)^2)^0.5. hx and hy are UNBOUNDED if the silhouette is no ellipse.
+    """
 
     skew: wp.float64
     xc: wp.float64
@@ -173,9 +181,10 @@ class SilhouetteSpans:
 
 @wp.func
 def silhouette_spans(p: ProjectedPrimitive, r: Ray, width: int, height: int, square: wp.float64):
-    """Return the row spans of a primitive's silhouette: the rays (x, e) with ``square`` |e|^2 > |x cross e|^2.
+    """Return the silhouette of an ellipsoid scaled by ``square``^0.5, in an image of ``width`` x ``height`` pixels.
 
-    In the row of pixel offset dv, the span's centre is XC + SKEW (dv - YC), and its half width follows from HX and HY.
+    Rays with origin x and direction e hit it if ``square`` |e|^2 > |x cross e|^2, in coordinates in which the unscaled
+    ellipsoid is the unit sphere.
     """
     o = SilhouetteSpans()
     o.hx = _UNBOUNDED
@@ -215,7 +224,10 @@ def silhouette_spans(p: ProjectedPrimitive, r: Ray, width: int, height: int, squ
 
 @wp.func
 def longest_half_chord(p: ProjectedPrimitive, r: Ray, v: View, reach: wp.float64):
-    """Return an upper bound, <= 1, of the half chords of all rays, in units of the longest semi-axis."""
+    """Return an upper bound, at most 1, of half the length of any chord, in units of the longest semi-axis.
+
+    A chord is the part of a ray inside the ellipsoid. ``reach`` is the ellipsoid's half extent along camera z.
+    """
     bound, one = d(1.0), d(1.0)
     if r.tc != d(0.0):
         z = p.centre[2]
@@ -245,7 +257,7 @@ def _chord_bound_by_edge(edge: int, hard: wp.float64, one: wp.float64, two: wp.f
 
 @wp.func
 def is_too_faint_to_draw(most: wp.float64, edge: int, least: wp.float64):
-    """Return whether no chord of a primitive, however long, can reach the optical depth ``least``."""
+    """Return whether no chord of a primitive with b2 + sum |w2| = ``most`` can reach the optical depth ``least``."""
     return most <= d(0.0) or most * _chord_bound_by_edge(edge, _N0, _N1, _N2) <= least
 
 
@@ -265,7 +277,12 @@ def visible_square(most: wp.float64, bound: wp.float64, edge: int, least: wp.flo
 
 @wp.struct
 class Ellipse:
-    """A primitive's silhouette on the screen, from the float32 values that pixel kernels read; ``box`` in pixels."""
+    """A primitive's silhouette on the screen, in pixels, from the float32 values that pixel kernels read.
+
+    With d = y + ``base``, row y is covered at ``middle`` + ``skew`` d +- ``hx`` (1 - (d/``hy``)^2)^0.5. The rightmost
+    point has d = ``peak``, the leftmost d = -``peak``. ``bounded`` is 0 if the silhouette is no ellipse but only the
+    ``box`` (x0, y0, x1, y1).
+    """
 
     box: wp.vec4i
     bounded: wp.int32
@@ -316,14 +333,14 @@ def tile_range(e: Ellipse, ty: int):
 
 @wp.func
 def _primitives_fit(ends: Longs2d, pairs: int, which: Ints):
-    """Return whether a frame's (tile, primitive) pairs and its float64 primitives fit into the arrays."""
+    """Return whether a frame's pairs and float64 primitives fit into the arrays; ``ends``: running sums of counts."""
     last = ends.shape[1] - 1
     return ends[0, last] <= wp.int64(pairs) and ends[1, last] <= wp.int64(which.shape[0])
 
 
 @functools.cache
 def _binning_kernels(short: bool) -> tuple[Any, Any]:
-    """Return the kernels that write and read the sort keys; ``short`` keys are int32, which sort in half the time."""
+    """Return the kernels ``emit`` and ``list_pairs``. ``short`` sort keys are int32, which sort in half the time."""
     number = wp.int32 if short else wp.int64
     Keys: Any = wp.array(dtype=number)
 
@@ -332,9 +349,11 @@ def _binning_kernels(short: bool) -> tuple[Any, Any]:
         rows: Vec4s2d, spans: Vec4s2d, boxes: Vec4is, order: Longs, counts: Ints2d, ends: Longs2d, across: int,
         images: Ints, tiles: int, first: Ints, keys: Keys, slots: Ints, which: Ints,
     ):  # fmt: skip
-        """Write one key, tile x N + rank, per tile that a primitive reaches; thread ``rank`` handles that depth rank.
+        """Write one sort key, tile x N + rank, for each tile that a primitive reaches; one thread per rank.
 
-        N is the number of primitives; ``tiles`` is the number of tiles per image, or 0 for one image.
+        N is the number of primitives; the rank is a primitive's place in the order of depth. Also fills ``first``,
+        ``slots`` and ``which`` for :func:`bin_primitives`. ``tiles`` is the number of tiles per image, or 0 for one
+        image.
         """
         rank = wp.tid()
         i = int(order[rank])
@@ -401,7 +420,8 @@ def bin_primitives(
     """Return a frame's tile lists, and ``slots`` and ``which`` of the primitives that are drawn in float64.
 
     ``slots`` (N,) has each primitive's float64 row or -1, ``which`` the primitive of each row. ``images`` holds each
-    primitive's image index, (N,) int32, and the number of images; None means one image.
+    primitive's image index, (N,) int32, and the number of images; None means one image. ``counts`` and ``counted`` are
+    those of :func:`count_tiles`, other tensors those of :class:`~neuprim.core.render.cuda.prepare.Frame`.
     """
     device, N, pairs = rows.device, depth.shape[0], counted.pairs
     across, down = -(-camera.width // L.TILE), -(-camera.height // L.TILE)

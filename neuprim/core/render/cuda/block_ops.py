@@ -80,9 +80,9 @@ def gradient_row_type(width: int) -> Any:
 
 @functools.cache
 def gradient_row_sums(width: int) -> Callable[..., Any]:
-    """Return a function (x, lane, out, pair) that sums row x over a warp's lanes and writes it to row ``pair``.
+    """Return a function (x, lane, out, pair) that sums the rows ``x`` of a warp's threads into row ``pair`` of ``out``.
 
-    ``width``, the length of a row, is a multiple of 32.
+    ``lane`` is the thread's number in the warp. ``width``, the length of a row, is a multiple of 32.
     """
     row = gradient_row_type(width)
 
@@ -107,7 +107,7 @@ def pixel_row_float(numbers: Floats, row: int, width: int, column: int) -> float
 
 @wp.func_native(f"return spans.data[size_t(pair) * {TILE} + y];")
 def span_of(spans: Shorts2d, pair: int, y: int) -> int:
-    """Return which pixels of tile row ``y`` a pair covers; see :func:`~neuprim.core.render.cuda.slots.row_spans`."""
+    """Return the packed span of covered pixels in tile row ``y`` of a pair; see :func:`~.chord.slot_of_pixel`."""
 
 
 @wp.func_native("return rows.data[size_t(row) * size_t(width) + column];")

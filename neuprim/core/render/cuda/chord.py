@@ -1,10 +1,15 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""The integral along one pixel's chord (ray inside an ellipsoid), with gradients: the cpu backend's formulas in Warp.
+"""Optical depth of a primitive along one pixel's ray, with gradients: the cpu backend's formulas in Warp.
 
-The optical depth is I = N_p |d| D^p half field. N_p normalises the edge, |d| is the length of the ray direction whose
-camera-z is 1, and D is 1 - |y|^2 at the middle. field is the mean of the density's numerator, weighted by the edge. cos
-and B_p of a phase in turns are polynomials up to half a turn, and recursions beyond (:mod:`neuprim.core.model.edge`).
-B_p' = -z B_(p+1)/(2p + 3): the backward pass also needs B_(p+1). Coefficients: tools/fit_polynomials.py.
+A chord is the part of a ray inside an ellipsoid. Its optical depth is I = N_p |d| D^p half field. N_p is the integral
+of (1 - u^2)^p over [-1, 1], p the exponent of the edge. |d| is the length of the ray direction whose camera-z is 1. D
+is 1 - |y|^2 at the chord's middle, y in whitened space, where the ellipsoid is the unit sphere. half is half the
+chord's extent along camera z, in units of the longest semi-axis m. field is the mean of m x density without edge,
+weighted by the edge: b2 + sum_k w2_k cos(phase_k) B_p(rate_k).
+
+Phases are in turns. cos is a polynomial of the phase less whole turns. B_p (:mod:`neuprim.core.model.edge`) is a
+polynomial up to half a turn, and a recursion beyond. The backward pass also needs B_(p+1), as B_p' =
+-z B_(p+1)/(2p + 3). Coefficients: tools/fit_polynomials.py.
 """
 
 from __future__ import annotations
@@ -43,6 +48,7 @@ def cos_turns(y: float):
 
 
 def _warp_polynomial(coefficients: tuple[float, ...]) -> Function:
+    """Return a Warp function that evaluates a polynomial with six ``coefficients``, lowest power first."""
     c0, c1, c2, c3, c4, c5 = coefficients
 
     @wp.func
@@ -63,7 +69,11 @@ def sin_turns(r: float):
 
 
 def chord_edge_profiles(edge: int) -> tuple[Function, Function]:
-    """Return Warp functions v -> B_p(2 pi v) and v -> (B_p, B_(p+1)) for edge exponent p = ``edge`` and any rate v."""
+    """Return Warp functions v -> B_p(2 pi v) and v -> (B_p, B_(p+1)) for edge exponent p = ``edge`` and any rate v.
+
+    v is the change of a neuron's phase over half a chord, in turns. B_p is the mean of its cosine on the chord,
+    weighted by the edge, divided by the cosine at the middle.
+    """
     low, high = _B[edge], _B[edge + 1]
 
     @wp.func
@@ -111,7 +121,7 @@ def opacity_of_depth(I: float):  # type: ignore[no-untyped-def]
 
 @wp.struct
 class Ray:
-    """The columns of a primitive's row that :func:`intersect_chord` needs; kernels load other columns separately."""
+    """The float4 columns E0 to XV of a primitive's row: the rays of all pixels (:mod:`neuprim.core.render.layout`)."""
 
     e0: wp.vec4
     ex: wp.vec4
@@ -125,8 +135,8 @@ class Ray:
 class Chord:
     """The part of a pixel's ray inside a primitive, in whitened space (where the primitive is the unit sphere).
 
-    Positions on the ray are counted from an origin that is moved along the ray by ``slide``, in units of the
-    primitive's longest semi-axis m.
+    t is the position on the ray: t + ``slide`` is the depth beyond the anchor, in units of the longest semi-axis.
+    ``mid`` is t at the chord's middle, ``half`` half of its range of t.
     """
 
     du: float  # pixel offset from the anchor
@@ -150,7 +160,7 @@ def xyz(a: wp.vec4):
 
 @wp.func
 def neuron_phase(q: wp.vec3, w: wp.vec4):
-    """Return a neuron's phase at q, in turns: three fused multiply-adds, as the sum begins with the neuron's phase."""
+    """Return a neuron's phase at ``q``, in turns; ``w`` is (WX, WY, WZ, PHASE). It takes three fused multiply-adds."""
     return w[3] + q[0] * w[0] + q[1] * w[1] + q[2] * w[2]
 
 
@@ -169,7 +179,7 @@ def load_ray(rows: Any, j: int):
 
 @wp.func
 def intersect_chord(r: Ray, px: float, py: float):
-    """Return the chord of the ray through pixel centre (px, py)."""
+    """Return the chord of the ray through pixel centre (px, py) in the primitive to which ``r`` belongs."""
     c = Chord()
     c.du = px - r.e0[3]
     c.dv = py - r.ex[3]
@@ -207,8 +217,8 @@ def chord_ends_backward(
 ):
     """Return dL/dm and dL/de of a ray with origin m and direction e, from the gradients of its chord.
 
-    ``gq`` is dL/d(chord's middle point), and ``gv`` dL/d(half e). The other arguments are gradients by half chord,
-    middle, tm, D and a = e.e; ``gD`` includes dL/dh dh/dD.
+    ``gq`` is dL/d(chord's middle point), and ``gv`` dL/d(half e). The other arguments are gradients by the half chord,
+    by t of the middle and of the closest point (tm), by D = 1 - |x|^2 and by a = e.e; ``gD`` includes dL/dh dh/dD.
     """
     gt1 = 0.5 * (g_mid + g_half)
     gt0 = 0.5 * (g_mid - g_half) * c.uncut
@@ -239,9 +249,10 @@ def pixel_of_lane(lane: int):
 
 @wp.func
 def slot_of_pixel(span: int, offset: int, x: int):
-    """Return the slot of pixel x in a tile row; -1 outside the row's span (start << 8 | last << 4 | first).
+    """Return the slot of pixel x in a tile row of a (tile, primitive) pair; -1 outside the row's span.
 
-    ``offset`` is the first slot of the (tile, primitive) pair.
+    ``span`` is start << 8 | last << 4 | first: covered pixels in earlier rows, last and first covered pixel. ``offset``
+    is the pair's first slot.
     """
     slot = int(-1)
     if x >= (span & 15) and x <= ((span >> 4) & 15):
@@ -251,9 +262,9 @@ def slot_of_pixel(span: int, offset: int, x: int):
 
 @wp.func
 def pixel_of_slot(spans: Any, n: int, s: int):
-    """Return (x, y) in the tile of slot ``s`` of pair ``n``, from row spans (start << 8 | last << 4 | first).
+    """Return (x, y) in the tile of slot ``s`` of pair ``n``, counted from the pair's first slot.
 
-    y is the last row whose span starts at or before s.
+    ``spans`` has 16 row spans per pair (:func:`slot_of_pixel`). y is the last row whose span starts at or before ``s``.
     """
     y = int(0)
     for b in range(4):

@@ -1,9 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Colour networks, per primitive and at pixels; the CUDA version of :mod:`neuprim.core.render.cpu.colour_net`.
+"""Evaluate the colour network of each primitive; the CUDA version of :mod:`neuprim.core.render.cpu.colour_net`.
 
-The per-primitive stage is in float64. A slot (one pixel of a (tile, primitive) pair) has a hue, the colour before
-max(0, .), which the forward pass saves. The gradient of a network reaches a ray only through the chord's middle, and is
-added to the gradient row of the density.
+A network maps the middle of a ray's chord to a colour. Its rows are prepared once per primitive, in float64. A slot
+(one pixel of a (tile, primitive) pair) has a hue, the colour before max(0, .), which the forward pass saves. The
+gradient of a network reaches a ray only through the chord's middle, and is added to the gradient row of the density.
 """
 
 import functools
@@ -82,7 +82,10 @@ class ColourNet:
 
 @wp.func
 def _whitened_unit(log_scale: wp.vec3d, quat: wp.vec4d, w: wp.vec3d, phase: wp.float64):
-    """Return (WX, WY, WZ, PHASE) of a network unit: frequencies in units of the semi-axes, and the phase, in turns."""
+    """Return (WX, WY, WZ, PHASE) of a network unit: frequencies in turns per semi-axis, and the phase in turns.
+
+    ``w`` are its frequencies on scene axes, in radians per longest semi-axis, and ``phase`` its phase in radians.
+    """
     p = project_primitive(wp.vec3d(), log_scale, quat, View())
     on_axes = _TURNS * wp.cw_mul(p.axes, wp.transpose(p.local) * w)
     turns = _TURNS * phase
@@ -91,6 +94,7 @@ def _whitened_unit(log_scale: wp.vec3d, quat: wp.vec4d, w: wp.vec3d, phase: wp.f
 
 @functools.cache
 def _colour_net_kernels(double: bool) -> tuple[Any, Any, Any]:
+    """Return the kernels ``fill_rows``, ``prepare_wide`` and ``backward``, for float64 (``double``) or float32."""
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
@@ -170,6 +174,7 @@ def _colour_net_kernels(double: bool) -> tuple[Any, Any, Any]:
 
 
 def _kernel_types(double: bool) -> tuple[Any, Any, Any]:
+    """Return the Warp types of numbers, 3-vectors and 4-vectors in float64 (``double``) or float32."""
     return (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
 
@@ -216,6 +221,7 @@ def colour_net_backward(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the float32 gradients of Wx, bias and Wout; add the gradients of log_scales and quats to ``out``.
 
+    ``parameters`` and ``out`` are the tensors of :data:`~neuprim.core.render.rasterize.PARAMETERS` and their gradients.
     ``weights`` has the (N, ...) gradient rows of the density, ``grads`` those of the networks, one per primitive.
     """
     _, log_scales, quats, *_ = parameters

@@ -2,8 +2,8 @@
 """The pixel stage in float64, for the few primitives for which float32 is not accurate enough.
 
 It computes chords, opacities and gradients. The formulas are those of :mod:`neuprim.core.render.cpu.float64`; a hard
-edge has the weight q = 1. Opacities and entries are stored in the slots (pixels of pairs) before compositing. For
-gradients of edges see :func:`neuprim.core.render.cpu.gradients.chord_gradient`.
+edge has the weight q = 1. Opacities and entries (depths at which rays enter) are stored in the slots (pixels of pairs)
+before compositing. For gradients of edges see :func:`neuprim.core.render.cpu.gradients.chord_gradient`.
 """
 
 from __future__ import annotations
@@ -76,7 +76,11 @@ def intersect_chord64(wide: Doubles2d, r: int, X: int, Y: int):
 
 @wp.struct
 class Weight:
-    """The edge weight q(u) along a chord: coefficients, mean, and dq/d(1 - |y|^2) as polynomial b0 + b1 u + b2 u^2."""
+    """The edge weight q(u) along a chord, u from -1 to 1, and its derivative.
+
+    ``q`` has the coefficients of the polynomial, lowest power first, and ``mean`` its mean. dq/d(1 - |y|^2) is
+    b0 + b1 u + b2 u^2.
+    """
 
     q: vec5d
     mean: wp.float64
@@ -87,7 +91,10 @@ class Weight:
 
 @wp.func
 def chord_edge_polynomial64(c: Chord64, edge: int):
-    """Return the edge weight q(u) = (D - a (shift + half u)^2)^p along a chord, u in [-1, 1], for p = ``edge``."""
+    """Return the edge weight q(u) = (D - a (shift + half u)^2)^p along a chord, u in [-1, 1], for p = ``edge``.
+
+    a is e.e, and shift is the distance in t from the point closest to the centre to the chord's middle.
+    """
     w = Weight()
     two, a, shift = d(2.0), d(1.0) / c.ia, c.mid - c.tm
     c0, c1, c2 = c.D - a * shift * shift, -two * a * shift * c.half, -a * c.half * c.half
@@ -138,7 +145,7 @@ def _chord_bessel(z: wp.float64):
 
 @wp.func
 def chord_moments(z: wp.float64):
-    """Return the means of u^n cos(z u) (n = 0, 2, 4) and u^n sin(z u) (n = 1, 3, 5) over [-1, 1], in the order of n."""
+    """Return six means over u in [-1, 1], for n = 0 to 5: of u^n cos(z u) if n is even, of u^n sin(z u) if n is odd."""
     j = _chord_bessel(z)
     two, three, eight = d(2.0), d(3.0), d(8.0)
     M = vec6d()
@@ -187,7 +194,7 @@ def weighted_moments64(w: Weight, M: vec6d):
 
 @wp.struct
 class Pull64:
-    """The gradient of a ray by its origin m, direction e and G = du EX + dv EY, which grows with the pixel offset."""
+    """Gradients of the loss by a ray's origin m, direction e and G = du EX + dv EY, the part of e = E0 + G."""
 
     m: wp.vec3d
     e: wp.vec3d
@@ -200,9 +207,10 @@ def chord_backward64(
     gD: wp.float64, gA: wp.float64,
     gq: wp.vec3d, gv: wp.vec3d,
 ):  # fmt: skip
-    """Return the gradient of a ray from the gradients of its chord, in float64; D has a floor in dh/dD.
+    """Return the gradient of a ray from the gradients of its chord, in float64; D is at least ``depth_floor`` in dh/dD.
 
-    For the arguments see :func:`~neuprim.core.render.cuda.chord.chord_ends_backward`.
+    For the arguments see :func:`~neuprim.core.render.cuda.chord.chord_ends_backward`. But ``gD`` excludes dL/dh dh/dD,
+    which is added here. ``tc`` is the anchor's depth / m.
     """
     half, two = d(0.5), d(2.0)
     gt1, gt0 = half * (g_mid + g_half), half * (g_mid - g_half) * c.uncut
@@ -219,7 +227,7 @@ def chord_backward64(
 
 @wp.func
 def ray_norm(lens: wp.vec4, X: int, Y: int):
-    """Return the length of the ray direction of pixel (X, Y), scaled to camera-z 1."""
+    """Return the length of the ray direction of pixel (X, Y), scaled to camera-z 1; ``lens`` is (fx, fy, cx, cy)."""
     x = (d(X) + d(0.5) - d(lens[2])) / d(lens[0])
     y = (d(Y) + d(0.5) - d(lens[3])) / d(lens[1])
     return wp.sqrt(x * x + y * y + d(1.0))
@@ -234,7 +242,7 @@ def float64_opacity_kernel(depth: bool) -> Any:
         pairs: Ints, wide: Doubles2d, slots: Ints, ids: Ints, tiles: Ints, spans: Shorts2d, offsets: Ints,
         lens: wp.vec4, limits: wp.vec4, size: wp.vec2i, neurons: int, edge: int, hits: Vec2s, depths: Floats,
     ):  # fmt: skip
-        """Store the opacities of ``pairs``, one block of threads each; ``slots[i]``: row of primitive i in ``wide``."""
+        """Store (alpha, entry depth) in slots of ``pairs``, a block each; ``slots``: primitives' rows in ``wide``."""
         member, lane = wp.tid()
         n, r = pairs[member], int(-1)
         if n >= 0:  # -1 fills the list
@@ -273,7 +281,7 @@ def float64_opacity_kernel(depth: bool) -> Any:
 
 @functools.cache
 def float64_pairs_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return the kernel for gradient rows of float64 pairs; with ``depth``, the depth image has a gradient, too."""
+    """Return the kernel for gradient rows of float64 pairs, one warp each; ``depth``: depth images have a gradient."""
     K, P, C = form.neurons, form.edge, form.channels
     width = L.gradient_width(K, C)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)

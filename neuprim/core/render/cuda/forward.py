@@ -2,9 +2,9 @@
 """Forward pass of compositing: one block per tile, one thread per pixel; two passes for ``sort = "entry"``.
 
 Primitives' rows are loaded into shared memory in batches. A tile is finished when T < T_min in all of its pixels, T the
-transmittance. A hit (a primitive on a pixel's ray) stores (alpha, T before it) in its slot
-(:func:`~neuprim.core.render.cuda.slots.row_spans`). The slots of primitives drawn in float64 already contain opacities
-(:mod:`~neuprim.core.render.cuda.float64`).
+transmittance. A slot is memory for one pixel of a (tile, primitive) pair
+(:func:`~neuprim.core.render.cuda.slots.row_spans`). A hit (a primitive on a pixel's ray) stores (alpha, T before it) in
+its slot. The slots of primitives drawn in float64 already contain opacities (:mod:`~neuprim.core.render.cuda.float64`).
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from neuprim.core.settings import RenderSettings
 
 @wp.func
 def entry_sort_key(pixel: int, entry: float):
-    """Return an int64 key that sorts by pixel, then by ``entry``, whose float bits are mapped to ordered integers."""
+    """Return an int64 key that sorts by pixel, then by ``entry``, the depth at which the ray enters the primitive."""
     bits = wp.int64(wp.cast(entry, wp.int32))
     if bits < wp.int64(0):
         bits = wp.int64(-1) - bits  # negative floats: larger ones have more bits
@@ -249,7 +249,7 @@ def _first_hit_of_pixel(keys: Longs, count: int, pixel: int):
 
 @functools.cache
 def composite_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return a kernel that composites sorted hits, one thread per pixel, and writes (alpha, T before) to slots."""
+    """Return a kernel that composites hits sorted by entry, one thread per pixel, and writes (alpha, T before them)."""
     C, H = form.channels, form.hidden
     colours = L.rasterizer_colour_column(form.neurons)
     colour_type = wp.types.vector(length=C, dtype=wp.float32)
@@ -325,11 +325,17 @@ class CompositedFrame:
 
 
 def warp_array(tensor: Tensor) -> Any:
+    """Return a tensor as a kernel argument with the Warp type of its dtype; int16 becomes uint16."""
     return array(tensor, _NUMBERS[tensor.dtype])
 
 
 class KernelArrays:
-    """Arrays and numbers of a frame as arguments of kernels."""
+    """Arrays and numbers of a frame as arguments of kernels.
+
+    ``lens`` is (fx, fy, cx, cy), ``size`` is (width, height), ``limits`` is
+    (alpha_min, alpha_max, transmittance_min, 0). ``units`` are the rows of colour networks. ``spans`` and ``offsets``
+    are those of :class:`CompositedFrame`, other arrays those of :class:`Frame`.
+    """
 
     def __init__(
         self, frame: Frame, net: ColourNet | None, settings: RenderSettings, spans: Tensor, offsets: Tensor

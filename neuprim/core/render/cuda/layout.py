@@ -62,7 +62,7 @@ def rasterizer_row_columns(neurons: int, channels: int) -> int:
 
 
 def wide_width(neurons: int) -> int:
-    """Return the length of a primitive's float64 row: the columns of the cpu backend without padding."""
+    """Return the length of a primitive's float64 ("wide") row: the columns of the cpu backend without padding."""
     return layout.NEURONS + PER_NEURON * neurons
 
 

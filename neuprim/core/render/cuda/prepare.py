@@ -93,7 +93,7 @@ def _largest_ray_component(v: wp.vec3d):
 
 @wp.func
 def _projected_frequency(w: wp.vec3d, p: ProjectedPrimitive, turns: wp.float64):
-    """Return a neuron's frequency vector on the ellipsoid's axes, in turns per semi-axis."""
+    """Return a neuron's frequencies ``w`` on the ellipsoid's axes, in turns per semi-axis; ``turns``: omega0 / 2 pi."""
     t = wp.transpose(p.local) * w
     return wp.vec3d(turns * p.axes[0] * t[0], turns * p.axes[1] * t[1], turns * p.axes[2] * t[2])
 
@@ -102,9 +102,9 @@ def _projected_frequency(w: wp.vec3d, p: ProjectedPrimitive, turns: wp.float64):
 def project_primitives_kernel(double: bool) -> Any:
     """Return a kernel that fills rows, spans, boxes, depth, status and counts of every primitive; launch size (N,).
 
-    Row 0 of ``counts`` (2, N) is the number of tiles reached, row 1 is 1 for visible primitives that need float64.
-    ``bad`` (1,) is the first primitive that is not finite, colours included. Samples of less optical depth than
-    ``least`` are skipped. ``forced`` primitives need float64.
+    Arrays are those of :class:`Frame`. Row 0 of ``counts`` (2, N) is the number of tiles reached, row 1 is 1 for
+    visible primitives that need float64. ``bad`` (1,) is the first primitive that is not finite, colours included.
+    Samples of less optical depth than ``least`` are skipped. ``forced`` primitives need float64.
     """
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 

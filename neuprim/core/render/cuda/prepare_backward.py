@@ -1,5 +1,5 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Backward pass of the projection of primitives, one thread each, as in the cpu backend's ``prepare_backward``."""
+"""Compute gradients of parameters and camera from gradient rows, one thread per primitive, as in the cpu backend."""
 
 import functools
 from typing import Any
@@ -36,7 +36,7 @@ def _load_gradient_vector(grads: Floats2d, i: int, column: int):
 
 @wp.func
 def quaternion_gradient(q: wp.vec4d, n: wp.float64, g: wp.mat33d):
-    """Return dL/dq from dL/dR, R the rotation of quaternion q; ``n`` is 1/|q|. No gradient is along q."""
+    """Return dL/dq from ``g`` = dL/dR, R the rotation of q; ``n`` is 1/|q|. The result is perpendicular to q."""
     two = d(2.0)
     w, x, y, z = q[0] * n, q[1] * n, q[2] * n, q[3] * n
     gw = two * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
@@ -55,6 +55,7 @@ def quaternion_gradient(q: wp.vec4d, n: wp.float64, g: wp.mat33d):
 
 @functools.cache
 def _prepare_backward_kernel(double: bool) -> Any:
+    """Return the kernel of :func:`prepare_backward` for float64 (``double``) or float32 parameters."""
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Projection of a primitive, in float64: the geometry of :mod:`neuprim.core.render.cpu.prepare`."""
+"""Project a primitive into a camera view, in float64: the geometry of :mod:`neuprim.core.render.cpu.prepare`."""
 
 from neuprim.core.compute.warp import OPTIONS, Doubles, wp
 from neuprim.core.render.layout import ANCHOR_RADII
@@ -29,7 +29,12 @@ class View:
 
 @wp.struct
 class ProjectedPrimitive:
-    """Orientation in camera (B) and scene axes, semi-axes over the longest (m), centre, anchor (depth, x, y), 1/|q|."""
+    """An ellipsoid in a view: orientation, semi-axes, centre, and anchor pixel.
+
+    The columns of ``B`` and ``local`` are its axes in camera and in scene axes. ``m`` is the longest semi-axis,
+    ``axes`` has all semi-axes / m. ``centre`` is in camera axes, scene units. ``anchor`` (depth, x, y) is the depth of
+    the centre and the pixel that shows it (:func:`project_primitive`). ``inverse`` is 1/|quaternion|.
+    """
 
     B: wp.mat33d
     local: wp.mat33d
@@ -44,8 +49,11 @@ class ProjectedPrimitive:
 class Ray:
     """The rays of all pixels through a primitive, in whitened space, where the ellipsoid is the unit sphere.
 
-    For pixel offset (du, dv) from the anchor, the ray is x(t) = (xa + du xu + dv xv + s G) + t (e0 + G), with G = du ex
-    + dv ey and s = du tu + dv tv. A = m S^-1 B^T converts camera axes to whitened axes.
+    For pixel offset (du, dv) from the anchor, let G = du ex + dv ey and s = du tu + dv tv. The ray is x(t) =
+    (xa + du xu + dv xv + s G) + t (e0 + G), with xu = tc ex + tu e0, xv = tc ey + tv e0 and t in units of the longest
+    semi-axis m. A = m S^-1 B^T converts camera axes to whitened axes, S the semi-axes. ``ref`` is the direction to the
+    anchor with camera-z 1. ``w`` is (anchor - centre)/m in camera axes. ``tc`` is the anchor's depth / m, ``near`` is t
+    at the near plane.
     """
 
     A: wp.mat33d
@@ -81,9 +89,10 @@ def load_projection_view(matrix: Doubles, intrinsics: wp.vec4d, near: wp.float64
 
 @wp.func
 def project_primitive(mean: wp.vec3d, log_scale: wp.vec3d, quat: wp.vec4d, v: View):
-    """Compute a primitive's orientation, centre and anchor pixel in the view ``v``.
+    """Return a primitive's orientation, centre and anchor pixel in the view ``v``.
 
-    The anchor is rounded *before* its use, so that pixel kernels subtract the same value.
+    The anchor shows the centre. If the primitive is near or behind the camera, or before the near plane, the anchor is
+    the principal point, with depth 0. It is rounded *before* its use, so that pixel kernels subtract the same value.
     """
     one, two = d(1.0), d(2.0)
     p = ProjectedPrimitive()
@@ -116,6 +125,7 @@ def project_primitive(mean: wp.vec3d, log_scale: wp.vec3d, quat: wp.vec4d, v: Vi
 
 @wp.func
 def whiten_rays(p: ProjectedPrimitive, v: View):
+    """Return the rays of all pixels in whitened space, where the ellipsoid ``p`` is the unit sphere."""
     r = Ray()
     r.tc = p.anchor[0] / p.m
     r.ref = wp.vec3d((p.anchor[1] - v.centre[0]) / v.focal[0], (p.anchor[2] - v.centre[1]) / v.focal[1], d(1.0))

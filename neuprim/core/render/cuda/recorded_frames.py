@@ -1,7 +1,7 @@
-"""Record frames as CUDA graphs, and replay them when a model is rendered again by the same camera from another place.
+"""Record frames as CUDA graphs, and replay them when a model is rendered again by a camera with the same intrinsics.
 
 The arrays of a recorded frame have fixed sizes. A frame that does not fit, or has numbers that are not finite, is
-rendered again without the recording, which enlarges the arrays or names the error.
+rendered again without the recording. That enlarges the arrays, or raises an error that names the cause.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class _Program:
 
 
 class FrameRecorder:
-    """Records the frames of one model as CUDA graphs. Parameters may change their values but not their memory.
+    """Records the frames of one model as CUDA graphs. If a parameter moves to other memory, recordings are discarded.
 
     Attributes:
         replayed: number of frames that were replayed.
@@ -58,7 +58,10 @@ class FrameRecorder:
         self, model: Primitives, camera: Camera, conditions: Conditions, settings: RenderSettings,
         background: Tensor | None,
     ) -> RenderOutput | None:  # fmt: skip
-        """Return a replayed frame. If None, the caller must render the frame and pass it to :meth:`observe`."""
+        """Return a replayed frame. If None, the caller must render the frame and pass it to :meth:`observe`.
+
+        A frame is recorded when its intrinsics, settings and shapes repeat and :meth:`observe` has set the array sizes.
+        """
         with self._turn:
             memory = tuple(value.data_ptr() for value in model.params.values())
             if memory != self._memory:

@@ -134,8 +134,8 @@ def refuse_frame(
 def count_slots(frame: Frame, counts: Tensor, capacity: FrameCapacity | None) -> tuple[int, Tensor, Tensor]:
     """Return the number of slots, the (pairs + 1,) first slot of each pair, and a list of the float64 pairs.
 
-    -1 pads the list. Waits for the device if there is no ``capacity``. Raises BackendUnavailable if there are too many
-    slots.
+    -1 pads the list. ``counts`` (2, pairs) comes from :func:`row_spans`. Waits for the device if there is no
+    ``capacity``. Raises BackendUnavailable if there are too many slots.
     """
     device, pairs = frame.device, counts.shape[1]
     ends = running_sums(counts)

@@ -280,12 +280,12 @@ _FREE = ("nsz", "contract", "reassoc")  # fast-math flags of LLVM in _two_points
 def _generate_two_march_points(context: Any, flat: Any, corner: Any, first: Any, second: Any) -> Any:
     """Generate LLVM vector code that interpolates the four channels of voxels trilinearly at two points of a cell.
 
-    Return the numba signature and the generator. Scalar code takes 1.4 times as long, since LLVM does not vectorise it.
+    Return the numba signature and the generator. The code returns the channels at the first, then at the second point.
+    Scalar code takes 1.4 times as long.
 
     Args:
         flat: float32 array of the interleaved voxels.
-        corner: (o, dy, dx) uint64: offset of the cell's lowest corner, and strides along y and x. The stride along z
-            is 4.
+        corner: (o, dy, dx) uint64: offset of the cell's lowest corner, strides along y and x. The stride along z is 4.
         first, second: (x, y, z) float32 fractions within the cell, of each point.
     """
     signature = types.UniTuple(types.float32, 8)(flat, corner, first, second)
@@ -333,7 +333,7 @@ _two_points: Any = intrinsic(_generate_two_march_points)
 
 @kernel
 def _march_image_rows(start, stop, values, skips, pose, lens, width, samples, parts, image):  # type: ignore[no-untyped-def]
-    """Render image rows start … stop.
+    """Render image rows start:stop.
 
     Args:
         values, skips: attributes of the :class:`Medium` to render.
@@ -436,7 +436,7 @@ def _trilinear_march_sample(v, i, j, k, x, y, z):  # type: ignore[no-untyped-def
 
 @kernel
 def _march_depths(start, stop, sigma, skips, target, units, result):  # type: ignore[no-untyped-def]
-    """Write the optical depth from each voxel of slices start … stop to a point, or along a direction to the border.
+    """Write the optical depth from each voxel of slices start:stop to a point, or along a direction to the border.
 
     Args:
         sigma: (X, Y, Z) float32 extinction of a medium.

@@ -403,12 +403,13 @@ def join_time_chunks(models: Sequence[Primitives], numbers: Sequence[int], overl
     for model in models:
         if not isinstance(model.density, TimeDensity) or model.density.seams:
             raise ConfigError(
-                f"a chunk's density is {type(model.density).__name__} {model.density.settings()}; "
-                "expected a TimeDensity without seams"
+                f"cannot join chunks: the density of a chunk is {type(model.density).__name__} "
+                f"{model.density.settings()}; expected a TimeDensity without seams (not joined yet)"
             )
         if any(getattr(model, kind).settings() != getattr(first, kind).settings() for kind in ("density", "colour")):
             raise ConfigError(
-                f"chunks have models of different forms: {first.density.settings()} and {model.density.settings()}"
+                "cannot join chunks: their models have different forms; expected equal settings of density and colour. "
+                f"Found the densities {first.density.settings()} and {model.density.settings()}"
             )
     density = TimeDensity(**{**first.density.settings(), "seams": overlaps})
     params = {name: torch.cat([model.params[name].detach().cpu() for model in models]) for name in first.params}

@@ -341,7 +341,8 @@ def _read_base(spec: TaskSpec, scene: str, package: str, preset: str, options: d
     paths = scene_node.pop(_PATHS, None) or []
     if not isinstance(paths, list) or any(name not in scene_node for name in paths) or "name" in scene_node:
         raise ConfigError(
-            f"scene/{spec.name}/{scene}.yaml: {_PATHS} may only list keys of the file, and no key may be called name"
+            f"scene/{spec.name}/{scene}.yaml: {_PATHS} may only list keys of the file, "
+            "and the file must have no key 'name'"
         )
     merged = OmegaConf.merge(dataclasses.asdict(RunSettings()), preset_node)
     base = _BaseConfig(

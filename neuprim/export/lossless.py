@@ -86,7 +86,7 @@ def _read_npz_export(path: Path) -> StoredModel:
         with zipfile.ZipFile(path) as archive:
             entries = {i.filename: i for i in archive.infolist()}
             if len(entries) != len(archive.infolist()) or len(entries) > 1000:
-                raise DataError(f"{path}: entries repeat or are more than 1000; expected an export of neuprim")
+                raise DataError(f"{path}: has repeated or more than 1000 entries; expected an export of neuprim")
             if "header.npy" not in entries:
                 raise DataError(f"{path}: no array 'header'; expected a file written by `neuprim export --format npz`")
             text = _read_npz_export_array(archive, entries["header.npy"], path, _HEADER_BYTES)

@@ -270,7 +270,9 @@ def open_inspection_truth(path: str, volume: Callable[[], DensityGridSource | No
     """
     place, scene = Path(path), volume()
     if scene is None:
-        raise DataError(f"--against {path}: the run's scene has no volumes, so the placement of the files is unknown")
+        raise DataError(
+            f"--against {path}: the run's scene has no volumes, so the position of these voxels in the scene is unknown"
+        )
     if path == "scene" and not place.exists():
         return scene, "ground truth: the scene's own volumes"
     if not place.exists():

@@ -245,7 +245,7 @@ class _RunFrames:
         return _round_scale_of_run_frames(most), _DEPTH / depth if depth > 0 else 1.0, tuple(focus.tolist())
 
     def frame(self, index: int) -> InspectionFrame:
-        """Return a frame with its conditions. Each grid of the frame is computed at most once."""
+        """Return frame ``index`` of the inspection; it computes its voxel grids on first use."""
         conditions, number = self.pairs[index]
         truth = self.truth
         return InspectionFrame(

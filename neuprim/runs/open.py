@@ -198,7 +198,8 @@ def read_metrics(run_dir: Path) -> dict[str, Any]:
 def kept_shares(model: Primitives) -> dict[str, float]:
     """Return name -> fraction of parameters that pruning has not removed, 0..1, e.g. ``{"density.neuron 0": 0.8}``.
 
-    A name is that of a unit, whose parameters pruning sets to zero together, or of a group of units.
+    A name is that of a unit, or of a group of units. A unit is e.g. one neuron: in each primitive, pruning sets all or
+    none of its parameters to zero.
     """
     kept: dict[str, float] = {}
     sizes: dict[str, int] = {}

@@ -165,7 +165,7 @@ class _RenderTradeoffSession(TradeoffSession):
             self.write_record()
 
     def draws_the_reference(self, point: TradeoffPoint) -> bool:
-        """Return whether a point has the reference's render settings and resolution, so that only its model differs."""
+        """Return whether a point differs from the run itself (the reference) in the model alone, not in rendering."""
         config, reference = self.setup.parse(point.words), self.setup.reference
         return config.settings == reference.settings and config.resolution == reference.resolution
 

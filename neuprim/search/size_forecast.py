@@ -326,7 +326,7 @@ class SizePredictor:
 
     @property
     def doubt(self) -> float:
-        """Uncertainty of the margins, dB, for the number of primitives with the most certain prediction."""
+        """Uncertainty of the predicted quality, dB, for the number of primitives with the most certain prediction."""
         return min((max(f.doubt for f in values.values()) for values in self.forecasts().values()), default=1.0)
 
     def predict(self, primitives: int) -> dict[str, list[float]]:

@@ -259,7 +259,7 @@ class TradeoffRecord:
         return [name for name in same if self.same.get(name) != same[name]]
 
     def leave_out(self, knob: str, words: Sequence[str], reason: str) -> None:
-        """Note the reason why a point is not measured. The note replaces an earlier note on the same point."""
+        """Note why the setting ``knob`` with the overrides ``words`` is not measured; replaces an earlier note."""
         words = tuple(words)
         others = [one for one in self.left_out if (one.knob, one.words) != (knob, words)]
         self.left_out = [*others, LeftOutPoint(knob, words, reason)]

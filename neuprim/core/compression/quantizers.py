@@ -258,7 +258,10 @@ DEFAULT_LEVEL = 3
 
 
 def bit_table(level: int, words: Iterable[str], specs: Iterable[ParameterSpec]) -> BitTable:
-    """Return a level's bit table with overrides ``NAME=BITS``, NAME a parameter or ``others``; raise ConfigError."""
+    """Return the bits of each parameter at a level of compression, changed by overrides ``NAME=BITS``.
+
+    NAME is a parameter or ``others``. Raises ConfigError if the level or an override is invalid.
+    """
     if level not in LEVELS:
         raise ConfigError(f"--level {level}: expected one of {', '.join(map(str, LEVELS))}")
     table, names = LEVELS[level], [spec.name for spec in specs]

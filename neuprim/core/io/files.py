@@ -190,7 +190,10 @@ def publish_folder(final: Path, write: Callable[[Path], None], complete: Callabl
 
 
 def fill_folder(final: Path, write: Callable[[Path], None], complete: Callable[[Path], bool]) -> None:
-    """Do as :func:`publish_folder`, but call ``write`` even if ``final`` is complete; its parent folder must exist."""
+    """Do as :func:`publish_folder`, but always call ``write``, before ``complete(final)`` is checked.
+
+    The parent folder of ``final`` must exist.
+    """
     draft = Path(tempfile.mkdtemp(prefix=f".{final.name}-", dir=final.parent))
     try:
         draft.chmod(0o755)  # mkdtemp's 0700 would hide a shared folder from its other users

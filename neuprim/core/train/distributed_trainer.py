@@ -205,7 +205,9 @@ class GradientSum:
         return self.shapes == {name: value.shape for name, value in params.items()}
 
     def add(self, params: Mapping[str, Tensor], contributions: Contributions) -> list[bool]:
-        """Add gradients and contributions of one view of every rank, in rank order; clear ``.grad`` of ``params``.
+        """Add the gradients of one view of every rank, in rank order, and the primitives' contributions to these views.
+
+        Clears ``.grad`` of ``params``.
 
         Returns, for each parameter, whether it had a gradient on this rank.
         """

@@ -153,7 +153,10 @@ class PointLossResult:
     shares: PointShares
 
     def contributions(self) -> Contributions:
-        """Return each primitive's contribution to extinction and error at the points, after the backward pass."""
+        """Return the sums over the points of each primitive's extinction, and of its extinction times the error.
+
+        The backward pass computes them, so call this method afterwards.
+        """
         return Contributions(self.shares.weight, self.shares.error_weight, self.rows)
 
     def psnr(self) -> float:

@@ -136,8 +136,8 @@ def _ssim_loss_maps(start, stop, x, y, height, channels, unequal, maps):  # type
     """Write derivatives of the mean SSIM for window rows start:stop; return the sum of SSIM over these rows.
 
     ``x`` and ``y`` are flat images of (height, width, channels). ``unequal`` comes from :func:`_find_unequal_columns`.
-    The planes of ``maps`` get the derivatives with respect to E[x], E[xx] and E[xy]. They have a zero border of 10
-    windows on every side.
+    The planes of ``maps`` get the derivatives with respect to E[x], E[xx] and E[xy]. There is one
+    per window, and 10 zeros on every side of the plane.
     """
     n = x.shape[0] // height
     reach = (SSIM_TAPS - 1) * channels

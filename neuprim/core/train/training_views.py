@@ -171,7 +171,7 @@ class _NumbersOfViews:
         return row
 
     def gradient(self, index: int) -> list[float] | None:
-        """Return the gradient of a view's parameters after :meth:`row` and a backward pass; None if there is none."""
+        """Return the gradient of a view's corrections, which :meth:`row` returned before the backward pass, or None."""
         grad = self._rows.pop(index).grad
         return None if grad is None else [float(x) for x in grad.tolist()]
 

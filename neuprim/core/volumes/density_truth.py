@@ -65,7 +65,7 @@ class DensityGridPlacement:
     extents: Sequence[GridExtent] = ()
 
     def matches(self, other: DensityGridPlacement) -> bool:
-        """Return whether ``other`` has the same frame numbers, transform, grid and extinction per value."""
+        """Return whether ``other`` has the same frame numbers, transform, grid and factor from values to extinction."""
         keys = ("scene_from_world", "numbers", "sigma_per_unit", "grid", "exact")
         mine, theirs = self.to_json(), other.to_json()
         return all(mine[key] == theirs[key] for key in keys)

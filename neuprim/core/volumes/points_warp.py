@@ -101,10 +101,11 @@ def _add_points(
     g_means: Vec3ds, g_A: Mat33ds, g_rate: Vec3ds2d, g_phase: Doubles2d, g_amplitude: Doubles2d,
     g_constant: Doubles, g_weights: Doubles2d, shares: Doubles2d,
 ):  # fmt: skip
-    """Add up the gradients of one of N primitives over some points, and its ``shares`` (sigma, sigma x error).
+    """Add up the gradients of one of N primitives over some points; also the sums of sigma and of sigma x error.
 
-    Thread (part, n) takes primitive n and points part, part + 8, ..., and writes row part x N + n. The gradient arrays
-    are given as zeros. ``pulled`` is the gradient of the values.
+    These two sums are ``shares``. Thread (part, n) takes primitive n and points part, part + 8, ..., and writes row
+    part x N + n. The gradient arrays are given as zeros. ``pulled`` is the gradient of the loss by the values at the
+    points.
     """
     part, n = wp.tid()
     row = part * means.shape[0] + n

@@ -107,7 +107,9 @@ def vdb_decompressor(flags: int) -> Callable[[bytes, int], bytes]:
             raise ValueError(f"a Blosc chunk of {len(chunk)} bytes; expected at least 16")
         claimed, length = sizes(chunk)
         if claimed != size or length != len(chunk):  # also what keeps the library from allocating gigabytes
-            raise ValueError(f"a Blosc chunk of {length} bytes for {claimed}; expected {len(chunk)} bytes for {size}")
+            raise ValueError(
+                f"a Blosc chunk says {length} bytes hold {claimed}; expected {len(chunk)} bytes that hold {size}"
+            )
         if not size:
             return b""
         try:

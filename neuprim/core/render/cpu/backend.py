@@ -73,7 +73,7 @@ def _cpu_array(tensor: Tensor) -> Array:
 
 
 def _rasterizer_arrays_by_name(tensors: Sequence[Tensor]) -> dict[str, Array]:
-    """Return tensors (PARAMETERS, then NET) as numpy arrays by name; float64 if dtypes differ: kernels take one."""
+    """Return tensors, in the order of PARAMETERS and NET, as numpy arrays by name; all float64 if dtypes differ."""
     arrays = [_cpu_array(x) for x in tensors]
     if len({x.dtype for x in arrays}) > 1:
         arrays = [x.astype(np.float64, copy=False) for x in arrays]

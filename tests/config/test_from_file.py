@@ -62,7 +62,7 @@ def test_what_is_typed_comes_first(stored: RunConfig) -> None:
 @pytest.mark.parametrize("word", ["task=dynamic", "preset=quick", "effort=3"])
 def test_what_the_file_has_said_already_is_refused(stored: RunConfig, word: str) -> None:
     with pytest.raises(
-        ConfigError, match=rf"{word}: the file of --config already has .*; leave {word.partition('=')[0]}= out"
+        ConfigError, match=rf"{word}: the file of --config already includes .*; leave {word.partition('=')[0]}= out"
     ):
         compose([word], stored=stored)
 

@@ -217,7 +217,9 @@ def volume_dataset(
     test = VdbFrameViews(capture, folder, held_out, exposure, memory=used.memory * _TEST_MEMORY)
     weights = [total_extinction_of_vdb_frame(capture, folder, frame) for frame in capture.frames]
     recording = VolumeRecording(name, capture, folder, exposure, weights, used.every, test)
-    voxels = FrameVoxels(capture, folder, train, weights[:: used.every], used.memory * _VOXEL_MEMORY)
+    frames = list(zip(train.frames, train.times, strict=True))
+    memory = used.memory * _VOXEL_MEMORY
+    voxels = FrameVoxels(capture, folder, frames, exposure, weights[:: used.every], memory)
     camera = capture.cameras[0]
     return Dataset(
         name=name,

@@ -8,10 +8,11 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from neuprim.core.data.dataset import PointSamples, PointSupervision
 from neuprim.core.errors import DataError, warn_once
@@ -21,9 +22,6 @@ from neuprim.core.io.vdb import VdbFrame
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.lit_medium import light_medium
 from neuprim.tasks.dynamic.volume.raymarch import Medium
-
-if TYPE_CHECKING:
-    from neuprim.tasks.dynamic.volume.capture_dataset import VdbFrameViews
 
 T = TypeVar("T")
 
@@ -164,16 +162,23 @@ class FrameVoxels(PointSupervision):
 
     Args:
         folder: store of the images. Lit voxels are stored there, too, since their light takes long to compute.
-        views: training views; their frames, times and exposure are used.
-        weights: total extinction of each frame of ``views``.
+        frames: the frames, each with its time, 0..1.
+        exposure: radiance that the training images show as 1.
+        weights: total extinction of each frame.
         memory: limit on the voxels in memory, bytes.
     """
 
     def __init__(
-        self, capture: Capture, folder: Store, views: VdbFrameViews, weights: Sequence[float], memory: float
+        self,
+        capture: Capture,
+        folder: Store,
+        frames: Sequence[tuple[VdbFrame, Tensor]],
+        exposure: float,
+        weights: Sequence[float],
+        memory: float,
     ) -> None:
-        self.capture, self.folder, self.frames, self.times = capture, folder, list(views.frames), list(views.times)
-        self.exposure, self.components = views.exposure, capture.components
+        self.capture, self.folder, self.exposure, self.components = capture, folder, exposure, capture.components
+        self.frames, self.times = [frame for frame, _ in frames], [time for _, time in frames]
         shares = torch.tensor(weights, dtype=torch.float64)
         self.chances = (1 - _ANY_FRAME) * shares / shares.sum().clamp_min(1e-300) + _ANY_FRAME / len(self.frames)
         self._voxels = RecentFrames(self._read_voxels, lambda v: v.index.nbytes + v.values.nbytes, memory)

@@ -225,11 +225,11 @@ def sample_visibility(
 
 
 def interleave_shadow_maps(alphas: np.ndarray, depths: np.ndarray, near: float) -> np.ndarray:
-    """Return (S + 2, S + 2, 2, slabs) float32: opacity, and opacity over depth, of each pixel; 0 around the images."""
+    """Return (S + 2, S + 2, 2, slabs) float64: opacity, and opacity over depth, of each pixel; 0 around the images."""
     slabs, size, _ = alphas.shape
-    maps = np.zeros((size + 2, size + 2, 2, slabs), np.float32)
+    maps = np.zeros((size + 2, size + 2, 2, slabs))
     maps[1:-1, 1:-1, 0] = np.moveaxis(alphas, 0, -1)
-    maps[1:-1, 1:-1, 1] = maps[1:-1, 1:-1, 0] / np.maximum(np.moveaxis(depths, 0, -1), near)
+    maps[1:-1, 1:-1, 1] = maps[1:-1, 1:-1, 0] / np.maximum(np.moveaxis(depths.astype(np.float64), 0, -1), near)
     return maps
 
 

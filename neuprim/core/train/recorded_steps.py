@@ -304,7 +304,7 @@ class StepRecorder:
         scales = rates + len(self.trainer.current_model.specs)
         samples, size = inputs.samples, scales
         if samples is not None:
-            size += 2 + len(samples.components)
+            size += 3 + len(samples.components)
         given = torch.empty(size, dtype=torch.float64, device=where)
 
         def like(value: Any) -> Any:

@@ -176,7 +176,7 @@ def test_a_training_without_views_is_refused(tmp_path: Path) -> None:
     ]
     config = compose(overrides)
     first, _ = run_ranks(2, lambda group: prepare_training(config, group=group))
-    assert isinstance(first, ConfigError) and "expected 1 process instead of 2" in str(first)
+    assert isinstance(first, ConfigError) and "expected 1 process, found 2" in str(first)
 
 
 # ------------------------------------------------------------ failures

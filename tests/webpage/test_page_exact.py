@@ -181,7 +181,8 @@ def test_smoke_under_a_light(octaves: int, anisotropy: float, chromium: Any, tmp
     with open_tab(chromium, tmp_path / "p.html") as tab:
         for light in (far, near):
             conditions = {"time": time, "light": light, "light_intensity": strength}
-            assert error(tab, model, camera_at(EYES[0]), conditions) < 20 * ERROR
+            # octaves take roots of the visibility, which amplify the rounding of small ones
+            assert error(tab, model, camera_at(EYES[0]), conditions) < (20 if octaves == 1 else 40) * ERROR
         assert tab.faults == []
 
 

@@ -181,8 +181,9 @@ def test_smoke_under_a_light(octaves: int, anisotropy: float, chromium: Any, tmp
     with open_tab(chromium, tmp_path / "p.html") as tab:
         for light in (far, near):
             conditions = {"time": time, "light": light, "light_intensity": strength}
-            # octaves take roots of the visibility, which amplify the rounding of small ones
-            assert error(tab, model, camera_at(EYES[0]), conditions) < (20 if octaves == 1 else 40) * ERROR
+            # seen from 1,000 radii away, float32 depths err by 6e-5 radii, where a slab absorbs over 0.12 radii
+            bound = 60 * ERROR if light is far else ERROR
+            assert error(tab, model, camera_at(EYES[0]), conditions) < bound
         assert tab.faults == []
 
 

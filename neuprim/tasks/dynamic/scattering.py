@@ -132,9 +132,9 @@ class ScatteringHarmonics(TimeHarmonics):
         own = super().lower(params, geometry, camera, conditions).rgb
         if SHINES in conditions:
             own = own * device.to_device_like(conditions[SHINES], own)
-        strength = light_factor(geometry, conditions, self.typical, falloff=False)
-        unoccluded = self._scattered(torch.ones_like(geometry.means[:, 0]), geometry, camera, conditions)
-        return Constant(params["scattered"].clamp_min(0.0) * strength * unoccluded[:, None], own)
+        strength = sum(self._phases(geometry, camera, conditions))
+        strength = strength * light_factor(geometry, conditions, self.typical, falloff=False)
+        return Constant(params["scattered"].clamp_min(0.0) * strength, own)
 
     def shade(
         self,
@@ -148,24 +148,20 @@ class ScatteringHarmonics(TimeHarmonics):
         if self.octaves == 1 or shading.primitives is None:
             return shading
         with torch.no_grad():
-            one, arriving = torch.ones_like(geometry.means[:, 0]), shading.primitives.to(geometry.means)
-            found, unoccluded = (self._scattered(t, geometry, camera, conditions) for t in (arriving, one))
-        return Shading(found / unoccluded)
+            phases = self._phases(geometry, camera, conditions)
+            octaves = octaves_of_light(shading.primitives.to(geometry.means)[:, None], self.octaves, 1.0)
+            found = sum(phase * light for phase, light in zip(phases, octaves, strict=True)) / sum(phases)
+        return Shading(found[:, 0])
 
-    def _scattered(
-        self, transmittance: Tensor, geometry: Geometry, camera: AnyCamera, conditions: Conditions
-    ) -> Tensor:
-        """Return (N,) S for the ``transmittance`` (N,) of the primitives; see the class."""
+    def _phases(self, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> list[Any]:
+        """Return share^o times the phase factor of each octave o: (N, 1), or a number for isotropic scattering."""
         if not self.anisotropy:
-            return scattered_light(transmittance, self.octaves, self.share)
+            return [self.share**octave for octave in range(self.octaves)]
         means, size = geometry.means, geometry.detached_length_scale[:, None]
         towards = normalize_direction(device.to_device_like(conditions["light"], means) - means, size)
         view = normalize_direction(means - device.to_device_like(camera.position, means), size)
-        cosine = (towards * view).sum(-1)
-        found = torch.zeros_like(transmittance)
-        for octave, light in enumerate(octaves_of_light(transmittance, self.octaves, self.share)):
-            found = found + light * phase_factor(cosine, self.anisotropy / 2**octave)
-        return found
+        cosine = (towards * view).sum(-1, keepdim=True)
+        return [self.share**o * phase_factor(cosine, self.anisotropy / 2**o) for o in range(self.octaves)]
 
     def script(self) -> str:
         return read_script(__package__, "scattering.js").replace("TIME_HARMONICS", super().script().strip())

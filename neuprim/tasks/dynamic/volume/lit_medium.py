@@ -239,6 +239,8 @@ class LitMedium:
     @property
     def mean(self) -> Medium:
         """The medium whose radiance is the mean over all view directions."""
+        if not self.beams:
+            return self.medium
         values = self.medium.values.copy()
         for beam, _ in self.beams:
             values[..., 1:] += beam.values[..., 1:]

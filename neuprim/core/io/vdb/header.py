@@ -142,7 +142,8 @@ MAGIC = 0x56444220
 VERSIONS = (222, 224)
 """Oldest and newest file version read. 222 introduced the present nodes, 223 Blosc; 224 changed only point grids."""
 
-_CHANNELS = {"Tree_float_5_4_3": 1, "Tree_vec3s_5_4_3": 3}
+_CHANNELS = {"Tree_float_5_4_3": 1, "Tree_vec3s_5_4_3": 3, "Tree_double_5_4_3": 1, "Tree_vec3d_5_4_3": 3}
+_DOUBLE_TREES = ("Tree_double_5_4_3", "Tree_vec3d_5_4_3")
 _HALF = "_HalfFloat"
 _DOUBLES = {"UniformScaleMap": 15, "ScaleMap": 15, "UniformScaleTranslateMap": 18, "ScaleTranslateMap": 18}
 _DOUBLES |= {"TranslationMap": 3, "AffineMap": 16, "UnitaryMap": 16}  # how many numbers store a map
@@ -176,8 +177,13 @@ class GridHeader:
 
     @property
     def channels(self) -> int:
-        """Number of values per voxel: 1 for float, 3 for vec3s, 0 for types that neuprim cannot read."""
+        """Number of values per voxel: 1 for numbers, 3 for vectors, 0 for types that neuprim cannot read."""
         return _CHANNELS.get(self.type, 0)
+
+    @property
+    def number(self) -> np.dtype[Any]:
+        """Type of numbers that are not stored as 16-bit floats."""
+        return np.dtype("<f8" if self.type in _DOUBLE_TREES else "<f4")
 
     @property
     def compression(self) -> str:
@@ -196,7 +202,7 @@ class GridHeader:
         if "ptdataidx" in self.type or "ptidx" in self.type:
             return f"holds points ({self.type}), which have no density; rasterise them to a fog volume first"
         if not self.channels:
-            return f"has values of type {self.type}; expected {' or '.join(_CHANNELS)} (also as half floats)"
+            return f"has values of type {self.type}; expected one of {', '.join(_CHANNELS)} (also as half floats)"
         if self.transform is None:
             return f"has a transform of class {self.map}; expected one of {', '.join(_DOUBLES)}"
         return None

@@ -117,9 +117,9 @@ class _TreeReader:
         self._cursor = cursor = VdbCursor(file.path, file.data, source.tree_at, source.block)
         self._flags, self._half, self._what = source.flags, source.half, what
         self._shape = (3,) if source.channels == 3 else ()
-        self._stored = np.dtype("<f2" if source.half else "<f4")
-        self._stored_size = self._stored.itemsize * source.channels
-        self._full_size = 4 * source.channels
+        self._full = source.number
+        self._stored = np.dtype("<f2") if source.half else self._full
+        self._stored_size, self._full_size = (kind.itemsize * source.channels for kind in (self._stored, self._full))
         self._packed = bool(source.flags & (ZIP | BLOSC))
         self._unpack = vdb_decompressor(source.flags)
         self._leaf_origins: list[np.ndarray] = []
@@ -130,7 +130,7 @@ class _TreeReader:
         self.origins = np.concatenate(self._leaf_origins) if self._leaf_origins else np.zeros((0, 3), np.int32)
         self.tiles = self._collect_tiles(source.channels)
         count = len(self.origins)
-        size = count * _LEAF * (self._full_size + 1)
+        size = count * _LEAF * (4 * source.channels + 1)  # as float32, with the masks
         if size > self._left:
             found = f"{count} leaves, which take {size} bytes in memory"
             raise cursor.fail(f"{what} has {found}; at most {self._left} are allowed")
@@ -151,9 +151,9 @@ class _TreeReader:
             raise cursor.fail(f"{what} has {buffers} buffers per leaf; expected 1")
         self.background = self._floats(cursor.take(self._full_size, f"background of {what}"))
         tiles, children = cursor.unpack("II", f"root of {what}")
-        layout = np.dtype([("origin", "<i4", 3), ("value", "<f4", self._shape), ("active", "u1")])
+        layout = np.dtype([("origin", "<i4", 3), ("value", self._full, self._shape), ("active", "u1")])
         found = np.frombuffer(cursor.take(tiles * layout.itemsize, f"{tiles} root tiles of {what}"), layout)
-        self._keep_tiles(found["origin"], TILE_SIZES[2], found["value"], found["active"] != 0)
+        self._keep_tiles(found["origin"], TILE_SIZES[2], _to_float32(found["value"]), found["active"] != 0)
         seen: set[tuple[int, ...]] = set()
         for entry in found["origin"].tolist():
             self._root_entry(seen, tuple(entry))
@@ -265,10 +265,10 @@ class _TreeReader:
         return cursor.fail(f"{what} has, before byte {cursor.at}, {error}")
 
     def _decoded(self, raw: bytes) -> np.ndarray:
-        return np.frombuffer(raw, self._stored).astype(np.float32, copy=False).reshape(-1, *self._shape)
+        return _to_float32(np.frombuffer(raw, self._stored)).reshape(-1, *self._shape)
 
     def _floats(self, raw: bytes) -> np.ndarray:
-        return np.frombuffer(raw, "<f4").reshape(self._shape).astype(np.float32)
+        return _to_float32(np.frombuffer(raw, self._full)).reshape(self._shape)
 
     def _leaves(self, first: int, last: int) -> None:
         """Decode leaves ``first`` to ``last`` - 1 into ``values`` and ``masks``; convert all values at once."""
@@ -340,6 +340,12 @@ class _TreeReader:
             at = cursor.at
         cursor.at = at
         return b"".join(masks), special, whole, b"".join(payloads)
+
+
+def _to_float32(values: np.ndarray) -> np.ndarray:
+    """Convert to float32; doubles beyond its range become infinite, which :attr:`VdbGrid.non_finite` counts."""
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32, copy=False)
 
 
 def _unpack_vdb_mask(raw: bytes) -> np.ndarray:

@@ -101,6 +101,31 @@ def test_vectors(tmp_path: Path) -> None:
     assert grid.channels == 3 and grid.to_dense(((8, 0, 16), (16, 8, 24))).shape == (8, 8, 8, 3)
 
 
+@pytest.mark.parametrize("flags", [2, 3, 6])
+def test_doubles_become_floats(tmp_path: Path, flags: int) -> None:
+    """Values beyond the range of float32 become infinite, which the grid counts."""
+    doubles = np.where(np.arange(512) == np.flatnonzero(MASK)[0], 1e300, RNG.normal(size=512)).astype("<f8")
+    body = b"\x02" + struct.pack("<d", 0.1) + packed(doubles[MASK].tobytes(), flags)
+    leaf = one_leaf(MASK, body, struct.pack("<d", 0.5), nothing(flags))
+    grid = read_grid(one_grid(tmp_path / "a.vdb", *leaf, flags=flags, kind="Tree_double_5_4_3"), "density")
+    with np.errstate(over="ignore"):
+        expected = np.where(MASK, doubles, 0.1).astype(np.float32)
+    np.testing.assert_array_equal(grid.values.ravel(), expected)
+    assert grid.background == np.float32(0.5) and grid.non_finite == 1 and not grid.half
+
+
+def test_half_doubles_and_double_vectors(tmp_path: Path) -> None:
+    """Background and inactive values stay doubles when active values are half floats."""
+    vectors = RNG.normal(size=(512, 3)).astype("<f2")
+    body = b"\x02" + struct.pack("<3d", 1, 2, 3) + vectors[MASK].tobytes()
+    leaf = one_leaf(MASK, body, struct.pack("<3d", 0.1, 0.2, 0.3))
+    grid = read_grid(one_grid(tmp_path / "a.vdb", *leaf, kind="Tree_vec3d_5_4_3_HalfFloat"), "density")
+    np.testing.assert_array_equal(
+        grid.values.reshape(512, 3), np.where(MASK[:, None], vectors.astype(np.float32), np.float32([1, 2, 3]))
+    )
+    assert grid.half and grid.channels == 3 and grid.background.tolist() == np.float32([0.1, 0.2, 0.3]).tolist()
+
+
 def test_tiles_of_all_levels(tmp_path: Path) -> None:
     tree = struct.pack("<if", 1, 0.0) + struct.pack("<II", 2, 1)
     tree += struct.pack("<3ifB", 4096, 0, 0, 1.5, 1)

@@ -4,6 +4,7 @@ caches."""
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -243,6 +244,55 @@ def test_a_grid_by_another_name_and_one_of_vectors(hot: Path, tmp_path: Path) ->
     write_vdb(hot / "ball_1.vdb", [vector])
     with pytest.raises(DataError, match=r"ball_1\.vdb: grid 'density' has 3 channels; expected 1"):
         dataset(hot, tmp_path)
+
+
+def sphere_level_set(radius: float, width: float = 1.5) -> VdbGrid:
+    """Signed distances to a sphere around ORIGIN + 6, in world units; voxels deeper than ``width`` are inactive."""
+    index = np.stack(np.meshgrid(*(np.arange(24),) * 3, indexing="ij"), -1)
+    distance = np.clip(np.linalg.norm((index - 12) * VOXEL, axis=-1) - radius, -width, width).astype(np.float32)
+    transform = vdb_scale_transform(VOXEL, ORIGIN)
+    grid = VdbGrid.from_dense("surface", distance, transform=transform, background=width)
+    return replace(grid, masks=grid.masks & (grid.values > np.float32(-width)), kind="level set")
+
+
+def test_a_level_set_is_read_as_fog_if_named(tmp_path: Path) -> None:
+    """Inside the surface, density rises from 0 to 1 at the level set's largest distance."""
+    for number in (1, 2):
+        write_vdb(tmp_path / f"ball_{number}.vdb", [sphere_level_set(4.0)])
+    with pytest.raises(DataError, match=r"surface \(is a level set.*scene.grids.density=NAME reads it as fog"):
+        dataset(tmp_path, tmp_path)
+    data = dataset(tmp_path, tmp_path, grids={"density": "surface"})
+    fog = recorded(data).capture.reader.read(tmp_path / "ball_1.vdb")["density"]
+    dense = fog.to_dense(((0, 0, 0), (24, 24, 24)))
+    depth = 4.0 - np.linalg.norm((np.indices((24, 24, 24)).transpose(1, 2, 3, 0) - 12) * VOXEL, axis=-1)
+    np.testing.assert_allclose(dense, np.clip(depth / 1.5, 0, 1), atol=1e-6)
+    assert fog.kind == "fog volume" and fog.active_voxels == np.count_nonzero(dense)
+
+
+def test_a_level_set_without_a_width_and_one_with_nan() -> None:
+    grid = sphere_level_set(4.0)
+    with pytest.raises(DataError, match=r"level set 'surface' has a background of -1.0; expected"):
+        replace(grid, background=np.array(-1, np.float32)).fog()
+    values = np.where(grid.values < -1, np.nan, grid.values)
+    fog = replace(grid, values=values).fog()
+    assert fog.non_finite == 0 and not fog.masks[np.isnan(values)].any() and fog.masks.any()
+
+
+def test_colour_in_three_grids(tmp_path: Path) -> None:
+    """Grids NAME_r, NAME_g and NAME_b of unlike bounds are the channels of NAME."""
+    smoke = blob(11.0, ("density",))
+    parts = [replace(blob(11.0 + c, ("x",))[0], name=f"color_{'rgb'[c]}") for c in range(3)]
+    for number in (1, 2):
+        write_vdb(tmp_path / f"ball_{number}.vdb", [*smoke, *parts])
+    reader = recorded(dataset(tmp_path, tmp_path, look="colorful_smoke")).capture.reader
+    assert reader.names["color"] == "color"
+    colour = reader.read(tmp_path / "ball_1.vdb")["color"]
+    box = ((0, 0, 0), (24, 18, 28))
+    np.testing.assert_array_equal(colour.to_dense(box), np.stack([p.to_dense(box) for p in parts], -1))
+    moved = replace(parts[2], transform=vdb_scale_transform(VOXEL, (0, 0, 0)))
+    write_vdb(tmp_path / "ball_2.vdb", [*smoke, *parts[:2], moved])
+    with pytest.raises(DataError, match=r"ball_2\.vdb: 'color_b' has another transform or number of channels"):
+        reader.read(tmp_path / "ball_2.vdb")
 
 
 def test_a_look_chosen_by_the_grids(folder: Path, tmp_path: Path) -> None:

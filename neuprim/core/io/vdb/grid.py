@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -123,6 +123,24 @@ class VdbGrid:
             half=half,
             metadata=dict(metadata or {}),
         )
+
+    def fog(self) -> VdbGrid:
+        """Convert a level set to a fog volume: 0 at and outside the surface, rising to 1 at the depth ``background``.
+
+        Depths are distances inside the surface, in world units; the value is linear in depth, as OpenVDB's
+        ``sdfToFogVolume`` makes it. NaN becomes 0. Raises DataError if the background is not a positive number.
+        """
+        width = float(self.background) if self.channels == 1 else 0.0
+        if not 0 < width < math.inf:
+            found = f"a background of {self.background.tolist()}"
+            raise DataError(f"level set {self.name!r} has {found}; expected its largest distance, a number above 0")
+        values, tile_values = (
+            np.nan_to_num(np.clip(distances / np.float32(-width), 0, 1))
+            for distances in (self.values, self.tiles.values)
+        )
+        tiles = replace(self.tiles, values=tile_values, active=tile_values > 0)
+        background = np.zeros((), np.float32)
+        return replace(self, background=background, values=values, masks=values > 0, tiles=tiles, kind="fog volume")
 
     @property
     def channels(self) -> int:

@@ -210,7 +210,7 @@ class GridHeader:
     def refusal(self) -> str | None:
         """Return why neuprim cannot use the grid as a volume; None if it can."""
         if self.kind == "level set":
-            return "is a level set: signed distances to a surface, not densities; convert it to a fog volume first"
+            return "is a level set: distances to a surface, not densities; scene.grids.density=NAME reads it as fog"
         return self.undecodable()
 
 

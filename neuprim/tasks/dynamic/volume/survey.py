@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from neuprim.core.errors import DataError, nearest
-from neuprim.core.io.vdb import VdbFrame, VdbGrid, read_grids, read_header
+from neuprim.core.io.vdb import DENSE_LIMIT, VdbFrame, VdbGrid, read_grids, read_header
 from neuprim.core.volumes.density_truth import GridExtent
 from neuprim.tasks.dynamic.volume.optics import Optics
 
@@ -55,33 +55,66 @@ class GridReader:
         )
 
     def read(self, path: Path) -> dict[str, VdbGrid]:
-        """Read one file: return meaning -> grid. Missing grids are left out, since exporters drop empty grids."""
+        """Read one file: return meaning -> grid. Missing grids are left out, since exporters drop empty grids.
+
+        Level sets become fog (:meth:`~neuprim.core.io.vdb.VdbGrid.fog`). Without a colour grid NAME, the grids NAME_r,
+        NAME_g and NAME_b are its channels.
+        """
         in_file = {grid.name for grid in read_header(path).grids}
-        wanted = {meaning: name for meaning, name in self.names.items() if name in in_file}
-        return dict(zip(wanted, read_grids(path, list(wanted.values())), strict=True))
+        found = {}
+        for meaning, name in self.names.items():
+            parts = _color_channels(name) if meaning == "color" and name not in in_file else [name]
+            if in_file.issuperset(parts):
+                grids = [g.fog() if g.kind == "level set" else g for g in read_grids(path, parts, level_sets=True)]
+                found[meaning] = grids[0] if len(grids) == 1 else _merge_color_channels(name, grids, path)
+        return found
+
+
+def _color_channels(name: str) -> list[str]:
+    return [f"{name}_{channel}" for channel in "rgb"]
+
+
+def _merge_color_channels(name: str, grids: Sequence[VdbGrid], path: Path) -> VdbGrid:
+    """Return the grid ``name`` with three channels from the grids of its channels, which must have the same voxels."""
+    first = grids[0]
+    for grid in grids:
+        if grid.channels != 1 or not np.allclose(grid.transform, first.transform, rtol=1e-6, atol=0):
+            expected = f"one number per voxel and the transform of {first.name!r}"
+            raise DataError(f"{path}: {grid.name!r} has another transform or number of channels; expected {expected}")
+    boxes = [grid.bounds for grid in grids if grid.bounds is not None] or [((0, 0, 0), (0, 0, 0))]
+    low, high = np.min(boxes, 0)[0].tolist(), np.max(boxes, 0)[1].tolist()
+    box = ((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+    values = np.stack([grid.to_dense(box, DENSE_LIMIT // 3, 0.0) for grid in grids], -1)
+    return VdbGrid.from_dense(name, values, lower=low, transform=first.transform)
 
 
 def find_volume_grids(frames: Sequence[VdbFrame], chosen: Mapping[str, str]) -> GridReader:
     """Find the grids that any frame has, first by the names that the user chose, then by common names.
 
     Raises:
-        DataError: a chosen grid is in no file or cannot be read (level sets, points), or no grid absorbs.
+        DataError: a chosen grid is in no file or cannot be read (such as points), or no grid absorbs.
     """
     refusals: dict[str, str | None] = {}  # name -> why the grid cannot be used
+    level_sets: set[str] = set()  # used only where the user names them
     for frame in frames:
         for grid in read_header(frame.path).grids:
             refusal = grid.refusal()
             if grid.name not in refusals or refusal is None:
                 refusals[grid.name] = refusal
+            if refusal and not grid.undecodable():
+                level_sets.add(grid.name)
     folder = frames[0].path.parent
     names: dict[str, str] = {}
     for meaning, usual in USUAL_NAMES.items():
+        if meaning == "color":
+            candidates = [*usual, chosen.get("color", usual[0])]
+            refusals |= {name: None for name in candidates if refusals.keys() >= set(_color_channels(name))}
         if meaning in chosen:
             name = chosen[meaning]
             where = f"{folder}: scene.grids.{meaning}={name}"
             if name not in refusals:
                 raise DataError(f"{where}: no frame has such a grid{nearest(name, refusals)}")
-            if refusals[name]:
+            if refusals[name] and name not in level_sets:
                 raise DataError(f"{where}: the grid {refusals[name]}")
             names[meaning] = name
         elif usable := [name for name in usual if name in refusals and refusals[name] is None]:

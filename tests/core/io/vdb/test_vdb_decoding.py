@@ -202,7 +202,7 @@ def test_foreign_grids_are_skipped_unread(tmp_path: Path) -> None:
     assert read_grid(path, "density").active_voxels == MASK.sum()
     refused(lambda: read_grid(path, "flags"), "a.vdb", "'flags'", "Tree_int32_5_4_3")
     refused(lambda: read_grid(path, "pts"), "'pts'", "holds points")
-    refused(lambda: read_grid(path, "sdf"), "'sdf'", "level set", "signed distances")
+    refused(lambda: read_grid(path, "sdf"), "'sdf'", "level set", "distances to a surface")
     assert read_grid(path, "sdf", level_sets=True).kind == "level set"
     assert [g.name for g in read_grids(path)] == ["density"]
     assert [g.name for g in read_grids(path, level_sets=True)] == ["sdf", "density"]

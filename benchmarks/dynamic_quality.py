@@ -1,7 +1,7 @@
 """Quality of the dynamic task on a real sequence, and which way of varying in time is worth its parameters.
 
     python benchmarks/dynamic_quality.py DIR [--frames 1:40] [--rows 13500x4000] [--presets quick equations hard]
-        [--seeds 3] [--parts main control between equations] [--edges 0 2] [--neurons 0 8] [--jobs 2] [--docs]
+        [--seeds 3] [--parts main control between equations voxels] [--edges 0 2] [--neurons 0 8] [--jobs 2] [--docs]
 
 DIR is a folder of .vdb files of JangaFX EmberGen (the recorded numbers: a free fire animation, frames 1 to 40). Parts:
 
@@ -12,11 +12,13 @@ DIR is a folder of .vdb files of JangaFX EmberGen (the recorded numbers: a free 
                are measured
     equations  the form of `quick`, that of the paper's equations 10 to 13 and their union, for each of --edges and
                --neurons, all with the bytes of --primitives of quick's and the same iterations
+    voxels     quick from images alone, and with voxels in every 16th, 4th and each step, in 4,000 steps; also on the
+               simulated scene smoke_fire at 160 x 160
 
-Images are 96 x 96, 40 cameras (two held out), linear RGB over the exposure's peak, black background; means over seeds
-+- half the spread, of the last checkpoint. Results go to benchmarks/results/dynamic_quality.json after every run, and
-only what is missing is run. --docs puts the recorded tables between the markers of docs/results/dynamic.md; without DIR
-nothing is run.
+Images of DIR are 96 x 96, 40 cameras (two held out), linear RGB over the exposure's peak, black background; means over
+seeds +- half the spread, of the last checkpoint. Results go to benchmarks/results/dynamic_quality.json after every run,
+and only what is missing is run. --docs puts the recorded tables between the markers of docs/results/dynamic.md; without
+DIR nothing is run.
 """
 
 from __future__ import annotations
@@ -56,7 +58,12 @@ from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 
 RECORD = RESULTS / "dynamic_quality.json"
-PARTS = ("main", "control", "between", "equations")
+PARTS = ("main", "control", "between", "equations", "voxels")
+VOXELS = {"images alone": "train.supervision=images"}
+VOXELS |= {
+    f"voxels {when}": f"train.voxels_every={n}"
+    for n, when in ((16, "in every 16th step"), (4, "in every 4th step"), (1, "in each step"))
+}
 FORMS = {
     "quick: window, motion": ("model.density.time=window+motion",),
     "equations 10 to 13, degree 3": ("preset=equations",),
@@ -141,6 +148,17 @@ def between_trials(args: argparse.Namespace, data: Sequence[str], seed: int) -> 
     for every in (1, 2):
         words, facts = (*data, f"scene.train_every={every}"), (("part", "between"), ("every", every))
         found.append(short_trial(args, f"between-{every}", words, seed, facts=facts))
+    return found
+
+
+def voxel_trials(args: argparse.Namespace, data: Sequence[str], seed: int) -> list[Trial]:
+    found = []
+    scenes = {"EmberGen fire": data, "`smoke_fire`": ("task=dynamic", "scene=smoke_fire")}
+    for (scene, words), (name, setting) in itertools.product(scenes.items(), VOXELS.items()):
+        facts = (("part", "voxels"), ("scene", scene), ("learned_from", name))
+        found.append(
+            Trial(f"voxels-{scene}-{name}-{seed}", (*words, setting), 4000, seed, 0, facts, interventions=None)
+        )
     return found
 
 
@@ -271,12 +289,27 @@ def control_table(control: Sequence[Run], between: Sequence[Run]) -> str:
     return f"{first}\n\n{second}"
 
 
+def voxels_table(runs: Sequence[Run]) -> str:
+    """Images alone beside images and voxels, at equal steps."""
+    columns = {
+        "scene": lambda own: own[0]["scene"],
+        "learned from": lambda own: own[0]["learned_from"],
+        "inside the mask": lambda own: f"{spread_of(own, 'psnr_mask')} dB",
+        "error of σ": lambda own: " / ".join(spread_of(own, f"sigma_relative_l2_{third}", 2) for third in THIRDS),
+        "CPU seconds": lambda own: f"{statistics.mean(run['cpu_seconds'] for run in own):.0f}",
+    }
+    groups = group_runs(runs, "scene", "learned_from")
+    order = list(VOXELS)
+    return make_table(columns, [groups[key] for key in sorted(groups, key=lambda key: (key[0], order.index(key[1])))])
+
+
 def make_tables(record: dict[str, Any]) -> dict[str, str]:
     """The text of each pair of markers."""
     parts = {key: runs for (key,), runs in group_runs(record["trials"], "part").items()}
     control = control_table(parts.get("control", []), parts.get("between", []))
     tables = {"dynamic-quality": main_table(parts["main"])} if "main" in parts else {}
     tables |= {"dynamic-equations": equations_table(parts["equations"])} if "equations" in parts else {}
+    tables |= {"dynamic-voxels": voxels_table(parts["voxels"])} if "voxels" in parts else {}
     notes = {name: f"\n\nMeans over seeds ± half the spread; {cpu}." for name, cpu in record["machines"].items()}
     return {name: text + notes["main"] for name, text in tables.items()} | {
         "dynamic-control": control + notes["control"]
@@ -300,6 +333,7 @@ def main() -> None:
         data = ["task=dynamic", "scene=vdb", "scene.look=embergen_fire", "scene.size=96"]
         data += [f"scene.vdb='{args.folder.resolve()}'", f"scene.frames='{args.frames}'"]
         make = {"main": main_trials, "control": control_trials, "between": between_trials, "equations": equation_trials}
+        make |= {"voxels": voxel_trials}
         for part in args.parts:
             trials = [trial for seed in range(args.seeds) for trial in make[part](args, data, seed)]
             known = read_record(RECORD).get("machines", {})

@@ -168,15 +168,18 @@ class PointLossResult:
 def point_loss(model: Primitives, samples: PointSamples, settings: TrainSettings, threads: int = 0) -> PointLossResult:
     """Return the loss of a model's extinction and source radiance against known values at points.
 
-    The loss sums mean squared errors, each error divided by its scale. Weights: 1 for the extinction, a small one for
-    each extinction component, ``train.voxel_colour`` for the source radiance and for the scattered radiance.
+    The loss sums mean squared errors, each error divided by its scale, and errors of the extinction also by 1 +
+    extinction/scale: what lies deep in dense matter is hidden. Weights: 1 for the extinction, a small one for each
+    extinction component, ``train.voxel_colour`` for the source radiance and for the scattered radiance.
     """
     colour = samples.source is not None and settings.voxel_colour > 0
     found = volume_values_at(model, samples.conditions, samples.points, colour, threads)
-    where = found.sigma.device
-    wrong = (found.sigma - device.copy_to_device(samples.sigma, where)) * (1 / samples.sigma_scale)
+    where, per_scale = found.sigma.device, 1 / samples.sigma_scale
+    sigma = device.copy_to_device(samples.sigma, where)
+    wrong = (found.sigma - sigma) * per_scale
+    parts = {"voxel_sigma": wrong.detach().square().mean()}
+    wrong = wrong / (1 + sigma * per_scale)
     loss = wrong.square().mean()
-    parts = {"voxel_sigma": loss.detach()}
     if found.source is not None and samples.source is not None:
         light = (found.source - device.copy_to_device(samples.source, where)) * (1 / samples.source_scale)
         parts["voxel_source"] = light.detach().square().mean()

@@ -14,7 +14,8 @@ Units (metadata ``neuprim_units``):
 * ``world``: extinction per world unit, which a volume shader multiplies by a length
 * ``scene``: extinction per scene unit, i.e. sigma
 
-``velocity=true``, ``emission=true`` and ``albedo=true`` add vector grids (:mod:`neuprim.export.vector_grids`).
+``velocity=true``, ``emission=true`` and ``albedo=true`` add vector grids (:mod:`neuprim.export.vector_grids`), and
+``usd=true`` a stage of the files (:mod:`neuprim.export.usd_volume`).
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ from neuprim.core.volumes.density_truth import (
     measure_density_errors,
 )
 from neuprim.export.shared import find_export_box
+from neuprim.export.usd_volume import write_usd_volume
 from neuprim.export.vector_grids import choose_look, choose_velocity
 
 OPTIONS = {
@@ -56,7 +58,8 @@ OPTIONS = {
     "velocity": (False, "also write the grid vel: velocities of the primitives, in world units per frame"),
     "emission": (False, "also write the grid emission: extinction times emitted colour, linear RGB"),
     "albedo": (False, "also write the grid albedo, of models trained with scene.lights=4"),
-    "fps": (None, "frames per second; with it, vel is in world units per second"),
+    "usd": (False, "also write density.usda, a USD stage that shows the files as a volume"),
+    "fps": (None, "frames per second, for usd; with it, vel is in world units per second"),
 }
 _SLAB_BYTES = 64 * 2**20
 _MOST_VOXELS = 2**34
@@ -98,6 +101,7 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
     moving = choose_velocity(job, sampler.model, [f.conditions for f in frames], scene_from_world)
     look = choose_look(job, frames[0].conditions, per_world, scene_from_world)
     whole = sampler._replace(model=job.run.model)
+    names, boxes = list[str](), list[np.ndarray]()
     metadata = {"neuprim_units": units, "neuprim_sigma_per_unit": 1 / factor, "neuprim_threshold": threshold}
     errors: dict[str, float] = {}
     for i, (frame, path) in enumerate(zip(frames, paths, strict=True)):
@@ -120,6 +124,8 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
         if moving is not None:
             vectors.append(moving.sample_grid(sampler.model, frame.conditions, grid))
         write_vdb(path, [grid, *vectors])
+        names, bounds = [g.name for g in (grid, *vectors)], grid.world_bounds()
+        boxes += [] if bounds is None else [bounds]
         if source is not None and frame.source is not None:
             errors |= _measure_vdb_errors(job, source, frame.source, frame.conditions)
             truth = None if look is None else source.look(frame.source)
@@ -139,6 +145,12 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
             f"errors: the model's extinction from {placement.grid!r} against the files' own values of that grid, "
             "on all their voxels, as in metrics.json"
         )
+    if job.flag("usd"):
+        files = {frame.number: path for frame, path in zip(frames, paths, strict=True)}
+        up = scene_from_world[:3, :3].T @ job.run.world.up.numpy()
+        stage = job.out / "density.usda"
+        write_usd_volume(stage, files, names, boxes, up, job.number("fps", 0.1, 240.0))
+        paths.append(stage)
     return ExportReport(tuple(paths), False, errors, tuple(notes))
 
 
@@ -253,6 +265,8 @@ def _name_vdb_files(job: ExportJob, frames: list[_GridFrame]) -> list[Path]:
     """Return the paths of the files to write: one file, or one per frame in a folder."""
     suffix = job.out.suffix.lower()
     if suffix == ".vdb":
+        if job.flag("usd"):
+            raise ConfigError(f"--out {job.out}: usd=true writes several files; expected a folder")
         if len(frames) > 1:
             raise ConfigError(f"--out {job.out}: {len(frames)} frames need several files; expected a folder")
         return [job.out]

@@ -205,8 +205,8 @@ def choose_velocity(
     """
     rate = job.number("fps", 0.1, 240.0)
     if not job.flag("velocity"):
-        if rate is not None:
-            raise ConfigError("fps: found without velocity; expected both. Pass velocity=true.")
+        if rate is not None and not job.flag("usd"):
+            raise ConfigError("fps: found without velocity and usd; expected one of them. Pass velocity=true.")
         return None
     active = model.active(frames[0])
     if "time" not in frames[0] or active.geometry is active.stored:

@@ -159,3 +159,39 @@ def test_a_time_when_nothing_lives_is_an_empty_frame(tmp_path: Path) -> None:
         read_grid(report.files[0], "density").active_voxels == 0
         and read_grid(report.files[1], "density").active_voxels > 0
     )
+
+
+def test_a_usd_stage_plays_the_files(moving: Path, tmp_path: Path) -> None:
+    """Read by usd-core: one volume, whose files follow the frame numbers, with a grid of each name."""
+    usd = pytest.importorskip("pxr.Usd", reason="needs usd-core: pip install 'neuprim[usd]'")
+    from pxr import UsdGeom, UsdVol
+
+    options = ["usd=true", "fps=25", "emission=true", "name=3 grids"]
+    report = export_run(moving, "vdb", tmp_path / "frames", options)
+    assert [p.name for p in report.files][-1] == "density.usda"
+    stage = usd.Stage.Open(str(report.files[-1]))
+    span = stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetFramesPerSecond(), stage.GetTimeCodesPerSecond()
+    assert span == (3, 5, 25, 25) and UsdGeom.GetStageUpAxis(stage) == "Z"
+    volume = UsdVol.Volume(stage.GetDefaultPrim())
+    paths = volume.GetFieldPaths()
+    assert set(paths) == {"_3_grids", "emission"}
+    for name, prim in paths.items():
+        asset = UsdVol.OpenVDBAsset(stage.GetPrimAtPath(prim))
+        grid = asset.GetFieldNameAttr().Get()
+        assert grid == {"_3_grids": "3 grids", "emission": "emission"}[name]
+        for number, path in zip((3, 4, 5), report.files, strict=False):
+            found = Path(asset.GetFilePathAttr().Get(number).resolvedPath)
+            assert found == path and read_grid(found, grid).name == grid
+    low, high = volume.GetExtentAttr().Get()
+    for path in report.files[:3]:
+        box = read_grid(path, "3 grids").world_bounds()
+        assert box is not None and (box[0] >= np.array(low) - 1e-5).all() and (box[1] <= np.array(high) + 1e-5).all()
+
+
+def test_a_usd_stage_of_one_file(static: Path, tmp_path: Path) -> None:
+    usd = pytest.importorskip("pxr.Usd", reason="needs usd-core: pip install 'neuprim[usd]'")
+    stage = usd.Stage.Open(str(export_run(static, "vdb", tmp_path / "d", ["grid=32", "usd=true"]).files[-1]))
+    asset = stage.GetPrimAtPath("/volume/density").GetAttribute("filePath")
+    assert Path(asset.Get().resolvedPath) == tmp_path / "d" / "density.vdb" and not asset.GetNumTimeSamples()
+    with pytest.raises(ConfigError, match=r"usd=true writes several files; expected a folder"):
+        export_run(static, "vdb", tmp_path / "d.vdb", ["usd=true"])

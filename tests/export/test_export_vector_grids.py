@@ -166,7 +166,7 @@ def test_an_empty_frame_has_an_empty_grid(tmp_path: Path) -> None:
     ("words", "message"),
     [
         (["velocity=true"], "velocity=true: the primitives of this model do not move; expected a model with motion"),
-        (["fps=24"], "fps: found without velocity; expected both. Pass velocity=true."),
+        (["fps=24"], "fps: found without velocity and usd; expected one of them. Pass velocity=true."),
     ],
 )
 def test_wrong_options_are_refused(tmp_path: Path, words: list[str], message: str) -> None:

@@ -70,7 +70,23 @@ LAYOUT = (
 _MAX_ROUNDING = 1e-4  # of centres in float32, as a share of the size of their cloud
 
 
-def _write_gaussian_ply(job: ExportJob) -> ExportReport:
+@dataclass(frozen=True)
+class ExportedGaussians:
+    """Gaussians that stand for a model under some conditions, in scene coordinates.
+
+    Attributes:
+        errors: PSNR of the Gaussians against the model: "psnr", the mean over views, and "psnr_worst".
+        notes: lines for the user, the same for all formats.
+    """
+
+    gaussians: Gaussians
+    colours: ExportHarmonics
+    errors: dict[str, float]
+    notes: tuple[str, ...]
+
+
+def fit_exported_gaussians(job: ExportJob) -> ExportedGaussians:
+    """Fit Gaussians to a model, of the size that :data:`OPTIONS` choose; raise ConfigError if nothing absorbs light."""
     size, which = job.choice("size", "auto", *SIZES), job.choice("views", "auto", "test", "orbit")
     (conditions,) = job.frames()
     channels, rgb = job.run.channels, find_export_rgb_channels(job.run)
@@ -85,22 +101,10 @@ def _write_gaussian_ply(job: ExportJob) -> ExportReport:
     scores = {name: _measure_gaussian_psnrs(job, fit, colours, images, background) for name, fit in fits.items()}
     size = max(scores, key=lambda name: float(np.mean(scores[name])))
     gaussians, errors = fits[size], {"psnr": float(np.mean(scores[size])), "psnr_worst": float(np.min(scores[size]))}
-    rows = _gaussian_ply_rows(gaussians, colours, job.run.world)
-    space = channels.color_space
-    comments = ["3D Gaussian splatting layout, fitted to neural primitives by neuprim (lossy)"]
-    comments += [LINEAR] * (space == "linear")
-    write_ply(job.out, rows, comments)
     notes = [
         f"{len(gaussians.means)} Gaussians, size={size}; PSNR of them drawn as the 3DGS rasteriser does, against "
-        f"the model's images, {seen}, {space} values",
-        "axes and units are those of the run's data; degree 3 harmonics",
+        f"the model's images, {seen}, {channels.color_space} values",
     ]
-    if rows.dtype["x"] == np.float64:
-        kept = float(np.spacing(np.abs(np.stack([rows[axis] for axis in "xyz"])).max().astype(np.float32)))
-        notes.append(
-            "x y z are double: the coordinates are so large that a program which takes them for float rounds "
-            f"them to {kept:.2g}"
-        )
     if colours.residual > 0:
         notes.append(
             "the model's colours are no harmonics of the view; fitted at the centres with an RMS error of "
@@ -113,9 +117,25 @@ def _write_gaussian_ply(job: ExportJob) -> ExportReport:
         )
     elif channels.display_text:
         notes.append(f"colours: {channels.display_text}")
+    return ExportedGaussians(gaussians, colours, errors, tuple(notes))
+
+
+def _write_gaussian_ply(job: ExportJob) -> ExportReport:
+    fitted, space = fit_exported_gaussians(job), job.run.channels.color_space
+    rows = _gaussian_ply_rows(fitted.gaussians, fitted.colours, job.run.world)
+    comments = ["3D Gaussian splatting layout, fitted to neural primitives by neuprim (lossy)"]
+    comments += [LINEAR] * (space == "linear")
+    write_ply(job.out, rows, comments)
+    notes = [*fitted.notes, "axes and units are those of the run's data; degree 3 harmonics"]
+    if rows.dtype["x"] == np.float64:
+        kept = float(np.spacing(np.abs(np.stack([rows[axis] for axis in "xyz"])).max().astype(np.float32)))
+        notes.append(
+            "x y z are double: the coordinates are so large that a program which takes them for float rounds "
+            f"them to {kept:.2g}"
+        )
     if space == "linear":
         notes.append("colours are linear, viewers take them for sRGB: they look darker there")
-    return ExportReport((job.out,), False, errors, tuple(notes))
+    return ExportReport((job.out,), False, fitted.errors, tuple(notes))
 
 
 def _gaussian_ply_rows(gaussians: Gaussians, colours: ExportHarmonics, world: World) -> np.ndarray:

@@ -38,6 +38,7 @@ from neuprim.core.render import render
 from neuprim.core.task import API_VERSION
 from neuprim.core.volumes.density_grid import density_grid
 from neuprim.export.shared import (
+    Z_UP_TO_GLTF,
     ExportHarmonics,
     choose_export_views,
     find_export_box,
@@ -62,8 +63,6 @@ OPTIONS = {
 _SUFFIXES = (".glb", ".ply", ".obj")
 _CHUNK = 2_000_000
 _MOST_VOXELS = 2**29
-_TO_GLTF = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""(4, 4) rotation from scene axes (z up) to glTF axes (y up): (x, y, z) becomes (x, z, -y)."""
 
 
 def _write_mesh(job: ExportJob) -> ExportReport:
@@ -230,7 +229,7 @@ def _save_mesh(mesh: Any, colours: Tensor, space: str, path: Path, up: str, worl
     linear, offset = np.eye(4), matrix[:3, 3]
     linear[:3, :3] = matrix[:3, :3]
     if suffix == ".glb" and up == "z":
-        linear, offset = _TO_GLTF @ linear, _TO_GLTF[:3, :3] @ offset
+        linear, offset = Z_UP_TO_GLTF @ linear, Z_UP_TO_GLTF[:3, :3] @ offset
     if (linear != np.eye(4)).any():
         written.apply_transform(linear)
     data: Any = _export_far_mesh(written, suffix, offset) if offset.any() else written.export(file_type=suffix[1:])

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,6 +16,9 @@ from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.extensions import ExportJob, TrainedModel
 from neuprim.core.model import sh
 from neuprim.core.model.fields import Conditions
+
+Z_UP_TO_GLTF = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""(4, 4) rotation from axes with z up to glTF's axes with y up: (x, y, z) becomes (x, z, -y)."""
 
 _DEGREE = 3
 _DIRECTIONS = 64

@@ -98,6 +98,14 @@ def test_exported_places_are_those_of_the_world(tmp_path: Path, world: World) ->
         back = read_points(file, 3, "srgb").within(world)
         assert torch.allclose(back.means, marked.PLACES, atol=1e-3)
     assert back.deviations is not None and torch.allclose(back.deviations[0], torch.full((3,), 0.3 / 5**0.5), rtol=0.1)
+    export_run(run, "gaussian-glb", tmp_path / "g.glb", ["size=moments", "views=orbit"])
+    scene = trimesh.load(tmp_path / "g.glb")
+    (node,) = scene.graph.nodes_geometry
+    matrix, name = scene.graph[node]
+    points = trimesh.transform_points(scene.geometry[name].vertices, matrix)
+    if abs(up := world.world_from_scene[:3, :3] @ world.up)[2] > abs(up)[1]:  # z is up: back from y up, as readers do
+        points = points[:, [0, 2, 1]] * [1, -1, 1]
+    assert np.abs(points - centers).max() < 1e-3 / world.scale
     export_run(run, "vdb", tmp_path / "d.vdb", ["grid=64"])
     grid = read_grid(tmp_path / "d.vdb", "density")
     low, high = (np.array(corner) for corner in grid.world_bounds())  # type: ignore[union-attr]

@@ -269,6 +269,14 @@ def test_a_level_set_is_read_as_fog_if_named(tmp_path: Path) -> None:
     assert fog.kind == "fog volume" and fog.active_voxels == np.count_nonzero(dense)
 
 
+def test_a_level_set_that_nobody_named_is_refused(tmp_path: Path) -> None:
+    """A grid that is fog in the first frame and a level set in the second."""
+    write_vdb(tmp_path / "ball_1.vdb", blob(11.0, ("density",)))
+    write_vdb(tmp_path / "ball_2.vdb", [replace(sphere_level_set(4.0), name="density")])
+    with pytest.raises(DataError, match=r"ball_2\.vdb: grid 'density' is a level set"):
+        dataset(tmp_path, tmp_path)
+
+
 def test_a_level_set_without_a_width_and_one_with_nan() -> None:
     grid = sphere_level_set(4.0)
     with pytest.raises(DataError, match=r"level set 'surface' has a background of -1.0; expected"):
@@ -276,6 +284,15 @@ def test_a_level_set_without_a_width_and_one_with_nan() -> None:
     values = np.where(grid.values < -1, np.nan, grid.values)
     fog = replace(grid, values=values).fog()
     assert fog.non_finite == 0 and not fog.masks[np.isnan(values)].any() and fog.masks.any()
+
+
+def test_a_level_set_without_a_width_is_refused_by_file(tmp_path: Path) -> None:
+    for number in (1, 2):
+        write_vdb(
+            tmp_path / f"ball_{number}.vdb", [replace(sphere_level_set(4.0), background=np.zeros((), np.float32))]
+        )
+    with pytest.raises(DataError, match=r"ball_1\.vdb: level set 'surface' has a background of 0.0; expected"):
+        dataset(tmp_path, tmp_path, grids={"density": "surface"})
 
 
 def test_colour_in_three_grids(tmp_path: Path) -> None:
@@ -291,7 +308,7 @@ def test_colour_in_three_grids(tmp_path: Path) -> None:
     np.testing.assert_array_equal(colour.to_dense(box), np.stack([p.to_dense(box) for p in parts], -1))
     moved = replace(parts[2], transform=vdb_scale_transform(VOXEL, (0, 0, 0)))
     write_vdb(tmp_path / "ball_2.vdb", [*smoke, *parts[:2], moved])
-    with pytest.raises(DataError, match=r"ball_2\.vdb: 'color_b' has another transform or number of channels"):
+    with pytest.raises(DataError, match=r"ball_2\.vdb: grid 'color_b' has another transform or number of channels"):
         reader.read(tmp_path / "ball_2.vdb")
 
 

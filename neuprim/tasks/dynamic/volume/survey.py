@@ -34,10 +34,12 @@ class GridReader:
     Attributes:
         names: meaning of a grid -> its name in the files.
         extinction: meaning of the grid that absorbs.
+        level_sets: names of the level sets to convert to fog; others are refused.
     """
 
     names: Mapping[str, str]
     extinction: str = "density"
+    level_sets: frozenset[str] = frozenset()
 
     def with_extinction(self, wanted: Sequence[str], folder: Path) -> GridReader:
         """Return a reader whose extinction grid is the first of ``wanted`` that the sequence has.
@@ -57,16 +59,19 @@ class GridReader:
     def read(self, path: Path) -> dict[str, VdbGrid]:
         """Read one file: return meaning -> grid. Missing grids are left out, since exporters drop empty grids.
 
-        Level sets become fog (:meth:`~neuprim.core.io.vdb.VdbGrid.fog`). Without a colour grid NAME, the grids NAME_r,
-        NAME_g and NAME_b are its channels.
+        Without a colour grid NAME, the grids NAME_r, NAME_g and NAME_b are its channels.
         """
         in_file = {grid.name for grid in read_header(path).grids}
         found = {}
         for meaning, name in self.names.items():
             parts = _color_channels(name) if meaning == "color" and name not in in_file else [name]
             if in_file.issuperset(parts):
-                grids = [g.fog() if g.kind == "level set" else g for g in read_grids(path, parts, level_sets=True)]
-                found[meaning] = grids[0] if len(grids) == 1 else _merge_color_channels(name, grids, path)
+                grids = list(read_grids(path, parts, level_sets=name in self.level_sets))
+                try:
+                    grids = [grid.fog() if grid.kind == "level set" else grid for grid in grids]
+                    found[meaning] = grids[0] if len(grids) == 1 else _merge_color_channels(name, grids)
+                except DataError as error:
+                    raise DataError(f"{path}: {error}") from error
         return found
 
 
@@ -74,13 +79,13 @@ def _color_channels(name: str) -> list[str]:
     return [f"{name}_{channel}" for channel in "rgb"]
 
 
-def _merge_color_channels(name: str, grids: Sequence[VdbGrid], path: Path) -> VdbGrid:
+def _merge_color_channels(name: str, grids: Sequence[VdbGrid]) -> VdbGrid:
     """Return the grid ``name`` with three channels from the grids of its channels, which must have the same voxels."""
     first = grids[0]
     for grid in grids:
         if grid.channels != 1 or not np.allclose(grid.transform, first.transform, rtol=1e-6, atol=0):
             expected = f"one number per voxel and the transform of {first.name!r}"
-            raise DataError(f"{path}: {grid.name!r} has another transform or number of channels; expected {expected}")
+            raise DataError(f"grid {grid.name!r} has another transform or number of channels; expected {expected}")
     boxes = [grid.bounds for grid in grids if grid.bounds is not None] or [((0, 0, 0), (0, 0, 0))]
     low, high = np.min(boxes, 0)[0].tolist(), np.max(boxes, 0)[1].tolist()
     box = ((low[0], low[1], low[2]), (high[0], high[1], high[2]))
@@ -95,7 +100,7 @@ def find_volume_grids(frames: Sequence[VdbFrame], chosen: Mapping[str, str]) -> 
         DataError: a chosen grid is in no file or cannot be read (such as points), or no grid absorbs.
     """
     refusals: dict[str, str | None] = {}  # name -> why the grid cannot be used
-    level_sets: set[str] = set()  # used only where the user names them
+    level_sets: set[str] = set()
     for frame in frames:
         for grid in read_header(frame.path).grids:
             refusal = grid.refusal()
@@ -124,7 +129,7 @@ def find_volume_grids(frames: Sequence[VdbFrame], chosen: Mapping[str, str]) -> 
         raise DataError(
             f"{folder}: no grid of density or temperature; found: {listed}. Name one: scene.grids.density=NAME"
         )
-    return GridReader(names)
+    return GridReader(names, level_sets=frozenset(level_sets & set(chosen.values())))
 
 
 # ---------------------------------------------------------------- measuring

@@ -103,6 +103,17 @@ def source_frames(header: Mapping[str, Any]) -> tuple[int, int] | None:
     return int(first), int(last)
 
 
+def frame_numbers(header: Mapping[str, Any], frames: Sequence[Mapping[str, Tensor]]) -> list[int]:
+    """Return the numbers that the source's files have, or would have, at the times of ``frames``; else 0, 1, ..."""
+    known = source_frames(header)
+    if known is not None and all("time" in conditions for conditions in frames):
+        exact = [known[0] + float(conditions["time"]) * (known[1] - known[0]) for conditions in frames]
+        numbers = [round(x) for x in exact]
+        if len(set(numbers)) == len(numbers) and all(abs(x - n) < 0.01 for x, n in zip(exact, numbers, strict=True)):
+            return numbers
+    return list(range(len(frames)))
+
+
 def frames_to_times(
     text: str, conditions: Mapping[str, str], header: Mapping[str, Any]
 ) -> tuple[list[int], dict[str, str]]:

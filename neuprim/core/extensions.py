@@ -70,6 +70,7 @@ class ExportJob:
         options: value of every option: the user's, as a number or boolean if it is one, or the default.
         conditions: condition name -> text, already checked; empty unless the exporter takes conditions.
         progress: function to call with (text, fraction 0..1).
+        frame: the conditions of the only frame to write, of a sequence; None: those of ``conditions``.
     """
 
     run: TrainedModel  # the model to export
@@ -77,6 +78,7 @@ class ExportJob:
     options: Mapping[str, Any] = field(default_factory=dict)
     conditions: Mapping[str, str] = field(default_factory=dict)
     progress: Callable[[str, float], None] = lambda text, fraction: None
+    frame: Mapping[str, Tensor] | None = None
 
     def frames(self, several: bool = False, names: Collection[str] | None = None) -> list[dict[str, Tensor]]:
         """Return the conditions of each frame that the user asked for; one frame unless ``several``.
@@ -85,6 +87,8 @@ class ExportJob:
             several: whether more than one frame is allowed.
             names: conditions that the export depends on; None: all of the task's. Other conditions are refused.
         """
+        if self.frame is not None:
+            return [dict(self.frame)]
         specs = [spec for spec in self.run.task.conditions if names is None or spec.name in names]
         for name in self.conditions:
             if name not in [spec.name for spec in specs]:
@@ -150,6 +154,8 @@ class Exporter:
         default: name of the file or folder in ``RUN_DIR/export``; "" for the exporter's name with the first suffix.
         suffixes: allowed suffixes, if the format is a single file: ``(".glb", ".ply")``; other names and folders are
             refused. Empty: the user may give any name of a file or folder.
+        sequence: whether neuprim calls ``write`` once per frame if the user asks for several frames. The files
+            NAME.0001.ply, ... are then in a folder.
     """
 
     api: int  # the API_VERSION that the exporter was written for
@@ -161,6 +167,7 @@ class Exporter:
     read: Callable[[Path], StoredModel] | None = None
     default: str = ""
     suffixes: tuple[str, ...] = ()
+    sequence: bool = False
 
 
 @dataclass(frozen=True)

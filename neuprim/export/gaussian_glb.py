@@ -117,6 +117,7 @@ EXPORTER = Exporter(
     _write_gaussian_glb,
     OPTIONS,
     conditions=True,
+    sequence=True,
     default="gaussians.glb",
     suffixes=(".glb",),
 )

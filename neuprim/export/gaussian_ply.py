@@ -12,8 +12,8 @@ The vertices are binary, little-endian, and consist of floats:
 
 :func:`fit_gaussians` fits the Gaussians. Colours stay in the model's colour space, but viewers show them as sRGB. A
 grey model is written as three equal channels. Models with channels other than red, green and blue are refused. A model
-that depends on time or light is exported for one time and light (``time=0.5``, ``light=1,2,3
-light_intensity=10,10,10``). Colours that are no spherical harmonics are approximated by spherical harmonics.
+that depends on time or light is exported for one time and light (``--time 0.5``, ``--light 1,2,3 --light-intensity
+10,10,10``), or as one file per frame. Colours that are no spherical harmonics are approximated by spherical harmonics.
 
 The reported error is a PSNR: images of the Gaussians, drawn as the 3DGS rasteriser does, against the model's images.
 """
@@ -388,6 +388,7 @@ EXPORTER = Exporter(
     _write_gaussian_ply,
     OPTIONS,
     conditions=True,
+    sequence=True,
     default="gaussians.ply",
     suffixes=(".ply",),
 )

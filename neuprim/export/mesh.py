@@ -289,6 +289,7 @@ EXPORTER = Exporter(
     _write_mesh,
     OPTIONS,
     conditions=True,
+    sequence=True,
     default="mesh.glb",
     suffixes=_SUFFIXES,
 )

@@ -21,7 +21,7 @@ Units (metadata ``neuprim_units``):
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -30,7 +30,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.core.conditions import source_frames
+from neuprim.core.conditions import frame_numbers
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport
 from neuprim.core.io.vdb import VdbGrid, VdbTiles, vdb_scale_transform, write_vdb
@@ -229,20 +229,9 @@ def _list_export_frames(job: ExportJob, placement: DensityGridPlacement | None) 
         names = None if placement is None else placement.times.keys()
         wanted = job.frames(several=True, names=names)
         source = [_export_source_frame(conditions, placement) for conditions in wanted]
-        numbers = _export_frame_numbers(job, wanted)
+        numbers = frame_numbers(job.run.header, wanted)
         return [_GridFrame(*frame) for frame in zip(numbers, wanted, source, strict=True)]
     return [_GridFrame(n, _export_frame_conditions(placement, i), i) for i, n in enumerate(placement.numbers)]
-
-
-def _export_frame_numbers(job: ExportJob, frames: Sequence[Conditions]) -> list[int]:
-    """Return the numbers that the source's files have, or would have, at the times of ``frames``; else 0, 1, ..."""
-    known = source_frames(job.run.header)
-    if known is not None and all("time" in conditions for conditions in frames):
-        exact = [known[0] + float(conditions["time"]) * (known[1] - known[0]) for conditions in frames]
-        numbers = [round(x) for x in exact]
-        if len(set(numbers)) == len(numbers) and all(abs(x - n) < 0.01 for x, n in zip(exact, numbers, strict=True)):
-            return numbers
-    return list(range(len(frames)))
 
 
 def _export_frame_conditions(placement: DensityGridPlacement, frame: int) -> dict[str, Tensor]:

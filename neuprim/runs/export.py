@@ -14,7 +14,7 @@ import torch
 
 from neuprim.core import checkpoint
 from neuprim.core.compression.file import is_compressed
-from neuprim.core.conditions import condition_flag, read_conditions, split_conditions
+from neuprim.core.conditions import condition_flag, frame_numbers, read_conditions, split_conditions
 from neuprim.core.errors import ConfigError, DataError, NeuprimError, nearest
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
 from neuprim.core.io.files import StagedOutput, refuse_existing, staged_output
@@ -55,29 +55,58 @@ def export_run(
         load_run(run)  # a missing package of the run itself is the more helpful error
         raise
     source = find_plugin_source(EXPORTERS, name)
-    final = _run_export_destination(run_dir, exporter, out)
-    refuse_existing(final, overwrite)
     model = open_run(run, progress)
     options, conditions = _parse_run_export_options(words, exporter, model.task.conditions)
     notes: list[str] = []
-    read_conditions(model.task.conditions, conditions, notes.append)
+    found = read_conditions(model.task.conditions, conditions, notes.append)
+    several = exporter.sequence and any(len(values) > 1 for values in found.values())
+    final = _run_export_destination(run_dir, exporter, out, several)
+    refuse_existing(final, overwrite)
     with staged_output(final, overwrite) as output:
         job = ExportJob(model, output.out, options, conditions, progress)
         with attribute_errors(source):
-            report = exporter.write(job)
+            report = _write_export_sequence(job, exporter) if several else exporter.write(job)
         files = _check_run_export_files(report, output, source.label)
         output.publish()
     return replace(report, files=files, notes=(*notes, *(output.final_text(note) for note in report.notes)))
 
 
-def _run_export_destination(run_dir: Path, exporter: Exporter, out: Path | None) -> Path:
+def _write_export_sequence(job: ExportJob, exporter: Exporter) -> ExportReport:
+    """Write one file per frame into the folder ``job.out``, numbered as the model's source, if it has numbers."""
+    frames = job.frames(several=True)
+    numbers, name = frame_numbers(job.run.header, frames), Path(_export_file_name(exporter))
+    width = max(4, len(str(max(numbers))))
+    job.out.mkdir()
+    reports = []
+    for i, (number, frame) in enumerate(zip(numbers, frames, strict=True)):
+        job.progress("writing frames", i / len(frames))
+        path = job.out / f"{name.stem}.{number:0{width}d}{name.suffix}"
+        reports.append(exporter.write(replace(job, out=path, frame=frame, progress=ignore_progress)))
+    return ExportReport(
+        tuple(file for report in reports for file in report.files),
+        all(report.lossless for report in reports),
+        {f"frame_{n:0{width}d}.{key}": x for n, r in zip(numbers, reports, strict=True) for key, x in r.errors.items()},
+        (f"{len(frames)} frames; of frame {numbers[0]}:", *reports[0].notes),
+    )
+
+
+def _export_file_name(exporter: Exporter) -> str:
+    return exporter.default or exporter.name + "".join(exporter.suffixes[:1])
+
+
+def _run_export_destination(run_dir: Path, exporter: Exporter, out: Path | None, several: bool) -> Path:
     """Return the path to write: ``out``, or a path in ``RUN_DIR/export`` with the exporter's default file name.
 
-    Raises ConfigError if the suffix of ``out`` does not fit the exporter.
+    With ``several`` frames, it is a folder. Raises ConfigError if the suffix of ``out`` does not fit the exporter.
     """
     if out is None:
-        return run_dir / "export" / (exporter.default or exporter.name + "".join(exporter.suffixes[:1]))
+        name = _export_file_name(exporter)
+        return run_dir / "export" / (Path(name).stem if several else name)
     fits = any(out.name.lower().endswith(suffix) and len(out.name) > len(suffix) for suffix in exporter.suffixes)
+    if several:
+        if fits:
+            raise ConfigError(f"--out {out}: several frames need several files; expected a folder")
+        return out
     if exporter.suffixes and (not fits or out.is_dir()):
         raise ConfigError(f"--out {out}: expected a file name that ends in {' or '.join(exporter.suffixes)}")
     return out

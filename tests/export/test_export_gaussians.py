@@ -195,7 +195,7 @@ def test_a_dynamic_model_needs_a_time_and_colours_follow_it(tmp_path: Path) -> N
     run = marked.dynamic_run(tmp_path / "run", marked.write_sequence(tmp_path / "files"))
     with pytest.raises(ConfigError, match=r"--time: required.*--time 0.5"):
         export_run(run, "gaussian-ply", tmp_path / "g.ply")
-    with pytest.raises(ConfigError, match="expected one value"):
+    with pytest.raises(ConfigError, match=r"g\.ply: several frames need several files; expected a folder"):
         export_run(run, "gaussian-ply", tmp_path / "g.ply", ["--time=0:1:3"])
     found = {}
     for t in (0.25, 0.5):
@@ -209,6 +209,21 @@ def test_a_dynamic_model_needs_a_time_and_colours_follow_it(tmp_path: Path) -> N
         light = torch.from_numpy(rows.columns(["f_dc_0", "f_dc_1", "f_dc_2"]) * sh.C0 + 0.5).clamp_min(0).float()
         assert torch.allclose(back.colors, light, atol=1e-5)
     assert np.allclose(found[0.5].rows["f_dc_0"] - found[0.25].rows["f_dc_0"], 0.1 * 0.25, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb"])
+def test_a_sequence_is_a_folder_of_numbered_files(tmp_path: Path, suffix: str) -> None:
+    """Each file is that of its own time, and has the number of the source's frame."""
+    run = marked.dynamic_run(tmp_path / "run", marked.write_sequence(tmp_path / "files"))
+    kind, options = f"gaussian-{suffix}", ["size=moments"]
+    report = export_run(run, kind, None, ["--time=0,0.5,1", *options])
+    numbers = ["0000", "0001", "0002"]  # this model's header names no frames
+    assert list(report.files) == [run / "export" / "gaussians" / f"gaussians.{n}.{suffix}" for n in numbers]
+    assert set(report.errors) == {f"frame_{n}.{key}" for n in numbers for key in ("psnr", "psnr_worst")}
+    alone = export_run(run, kind, tmp_path / f"a.{suffix}", ["--time=0.5", *options]).files[0]
+    assert report.files[1].read_bytes() == alone.read_bytes() != report.files[0].read_bytes()
+    with pytest.raises(ConfigError, match=r"gaussians: exists and is not empty"):
+        export_run(run, kind, None, ["--time=0,1", *options])
 
 
 def test_colours_of_lobes_are_fitted_and_the_loss_is_stated(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import OpenEXR
 import pytest
 import torch
 import trimesh
+from pxr import Usd, UsdVol
 
 from neuprim.core import checkpoint
 from neuprim.core.cameras import Camera, look_at
@@ -106,6 +107,11 @@ def test_exported_places_are_those_of_the_world(tmp_path: Path, world: World) ->
     if abs(up := world.world_from_scene[:3, :3] @ world.up)[2] > abs(up)[1]:  # z is up: back from y up, as readers do
         points = points[:, [0, 2, 1]] * [1, -1, 1]
     assert np.abs(points - centers).max() < 1e-3 / world.scale
+    export_run(run, "gaussian-usd", tmp_path / "g.usdc", ["size=moments", "views=orbit"])
+    stage = Usd.Stage.Open(str(tmp_path / "g.usdc"))
+    prim = UsdVol.ParticleField3DGaussianSplat(stage.GetDefaultPrim())
+    places = np.array(prim.GetPositionsAttr().Get()) + np.array(prim.GetTranslateOp().Get())
+    assert np.abs(places - centers).max() < 1e-3 / world.scale
     export_run(run, "vdb", tmp_path / "d.vdb", ["grid=64"])
     grid = read_grid(tmp_path / "d.vdb", "density")
     low, high = (np.array(corner) for corner in grid.world_bounds())  # type: ignore[union-attr]

@@ -300,7 +300,9 @@ def voxels_table(runs: Sequence[Run]) -> str:
     }
     groups = group_runs(runs, "scene", "learned_from")
     order = list(VOXELS)
-    return make_table(columns, [groups[key] for key in sorted(groups, key=lambda key: (key[0], order.index(key[1])))])
+    rows = [groups[key] for key in sorted(groups, key=lambda key: (key[0], order.index(key[1])))]
+    seeds = len({run["seed"] for run in runs})
+    return f"{make_table(columns, rows)}\n\n{runs[0]['iterations']:,} steps, {seeds} seed(s)."
 
 
 def make_tables(record: dict[str, Any]) -> dict[str, str]:

@@ -72,7 +72,7 @@ TABLES: dict[str, tuple[str, str, Callable[[Any], object]]] = {
     "relight": ("docs/results/relighting.md", "quality", lambda s: s.table(s.read_record(s.RESULTS / "relight.json"))),
     **{
         name: ("docs/results/dynamic.md", "dynamic_quality", lambda s, name=name: s.make_tables(record_of(s))[name])
-        for name in ("dynamic-quality", "dynamic-equations", "dynamic-control")
+        for name in ("dynamic-quality", "dynamic-equations", "dynamic-control", "dynamic-voxels")
     },
     "webpage": ("docs/results/performance.md", "webpage", lambda s: s.page_table(record_of(s)["runs"])),
     "webpage-prepare": ("docs/results/performance.md", "webpage", lambda s: s.prepare_table(record_of(s)["prepare"])),

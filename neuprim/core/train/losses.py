@@ -168,9 +168,10 @@ class PointLossResult:
 def point_loss(model: Primitives, samples: PointSamples, settings: TrainSettings, threads: int = 0) -> PointLossResult:
     """Return the loss of a model's extinction and source radiance against known values at points.
 
-    The loss sums mean squared errors, each error divided by its scale, and errors of the extinction also by 1 +
-    extinction/scale: what lies deep in dense matter is hidden. Weights: 1 for the extinction, a small one for each
-    extinction component, ``train.voxel_colour`` for the source radiance and for the scattered radiance.
+    The loss sums mean squared errors, each error divided by its scale. Beside images, squared errors of the extinction
+    are also divided by 1 + extinction/scale, because images do not show what lies deep in dense matter. Weights: 1 for
+    the extinction, a small one for each extinction component, ``train.voxel_colour`` for the source radiance and for
+    the scattered radiance.
     """
     colour = samples.source is not None and settings.voxel_colour > 0
     found = volume_values_at(model, samples.conditions, samples.points, colour, threads)
@@ -178,7 +179,8 @@ def point_loss(model: Primitives, samples: PointSamples, settings: TrainSettings
     sigma = device.copy_to_device(samples.sigma, where)
     wrong = (found.sigma - sigma) * per_scale
     parts = {"voxel_sigma": wrong.detach().square().mean()}
-    wrong = wrong / (1 + sigma * per_scale)
+    if settings.supervision == "both":
+        wrong = wrong / (1 + sigma * per_scale).sqrt()
     loss = wrong.square().mean()
     if found.source is not None and samples.source is not None:
         light = (found.source - device.copy_to_device(samples.source, where)) * (1 / samples.source_scale)

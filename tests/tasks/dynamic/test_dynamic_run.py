@@ -123,7 +123,7 @@ def test_the_preset_of_the_equations_is_the_papers_form_at_the_bytes_of_quick(fi
     assert equations.model.density == paper.model.density == {"time": "phase"}
     assert equations.model.colour == {"powers": 4, "waves": 4, "frequencies": "printed"}
     assert equations.model.sh_degree == 3
-    assert (equations.train.voxels_every, quick.train.voxels_every) == (4, 16), "about the same share of a step's time"
+    assert equations.train.voxels_every == quick.train.voxels_every == 4
     train = dataclasses.replace(equations.train, voxels_every=quick.train.voxels_every)
     assert (train, equations.renderer) == (quick.train, quick.renderer), "the budget and the rates are those of quick"
     words = "preset=equations train.iterations=20 train.population.every=5 train.population.start=0 model.neurons=8"
@@ -160,7 +160,8 @@ def test_frames_are_chosen_by_number_and_name_their_files(finished: Path, tmp_pa
 
 
 def test_exports_and_inspections_take_frame_numbers(finished: Path, tmp_path: Path) -> None:
-    words = ["export", str(finished), "--format", "vdb"]
+    # the default threshold depends on the box of the chosen frames
+    words = ["export", str(finished), "--format", "vdb", "threshold=1e-4"]
     assert main([*words, "--frame", "2-4x2", "--out", str(tmp_path / "some")]) == 0
     assert sorted(file.name for file in (tmp_path / "some").iterdir()) == ["density_0002.vdb", "density_0004.vdb"]
     assert main([*words, "--out", str(tmp_path / "all")]) == 0

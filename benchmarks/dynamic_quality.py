@@ -59,10 +59,11 @@ from neuprim.tasks.dynamic.time_density import TimeDensity
 
 RECORD = RESULTS / "dynamic_quality.json"
 PARTS = ("main", "control", "between", "equations", "voxels")
-VOXELS = {"images alone": "train.supervision=images"}
-VOXELS |= {
-    f"voxels {when}": f"train.voxels_every={n}"
-    for n, when in ((16, "in every 16th step"), (4, "in every 4th step"), (1, "in each step"))
+VOXELS = {
+    "images alone": "train.supervision=images",
+    "voxels in every 16th step": "train.voxels_every=16",
+    "voxels in every 4th step": "train.voxels_every=4",
+    "voxels in each step": "train.voxels_every=1",
 }
 FORMS = {
     "quick: window, motion": ("model.density.time=window+motion",),
@@ -334,8 +335,8 @@ def main() -> None:
     if args.folder:
         data = ["task=dynamic", "scene=vdb", "scene.look=embergen_fire", "scene.size=96"]
         data += [f"scene.vdb='{args.folder.resolve()}'", f"scene.frames='{args.frames}'"]
-        make = {"main": main_trials, "control": control_trials, "between": between_trials, "equations": equation_trials}
-        make |= {"voxels": voxel_trials}
+        functions = (main_trials, control_trials, between_trials, equation_trials, voxel_trials)
+        make = dict(zip(PARTS, functions, strict=True))
         for part in args.parts:
             trials = [trial for seed in range(args.seeds) for trial in make[part](args, data, seed)]
             known = read_record(RECORD).get("machines", {})

@@ -24,19 +24,19 @@ import torch
 from neuprim.core.cameras.world import World
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport
 from neuprim.core.io.files import atomic_path
+from neuprim.core.model import sh
 from neuprim.core.task import API_VERSION
 from neuprim.export.gaussian_ply import OPTIONS, ExportedGaussians, fit_exported_gaussians
-from neuprim.export.shared import Z_UP_TO_GLTF
+from neuprim.export.shared import Z_UP_TO_GLTF, y_is_up
 
 _NAME = "KHR_gaussian_splatting"
-_SH_0 = 0.28209479177387814  # spherical harmonic of degree 0
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def _write_gaussian_glb(job: ExportJob) -> ExportReport:
     fitted = fit_exported_gaussians(job)
     matrix = job.run.world.world_from_scene.double()
-    turned = abs(float(job.run.world.up @ matrix[1, :3])) <= abs(float(job.run.world.up @ matrix[2, :3]))
+    turned = not y_is_up(matrix[:3, :3] @ job.run.world.up)
     if turned:
         matrix = torch.from_numpy(Z_UP_TO_GLTF) @ matrix
     attributes, offset = _gaussian_attributes(fitted, matrix)
@@ -55,23 +55,18 @@ def _gaussian_attributes(fitted: ExportedGaussians, matrix: torch.Tensor) -> tup
 
     ``matrix`` (4, 4) float64 maps scene coordinates to the file's.
     """
-    world = World(matrix)
-    gaussians, colours = fitted.gaussians.to_scene(world), fitted.colours.rotate(world.rotation)
-    scales, quats = gaussians.axes()
-    opacity, dc = gaussians.opacities.numpy()[:, None], colours.dc[gaussians.rows].numpy()
-    rest = colours.rest[gaussians.rows].numpy()
-    offset = matrix[:3, 3].numpy()
+    means, scales, quats, opacity, harmonics = fitted.placed(World(matrix))
+    offset, opacity = matrix[:3, 3].numpy(), opacity[:, None]
     found = {
-        "POSITION": gaussians.means.numpy() - offset,
-        "COLOR_0": np.concatenate([np.clip(_SH_0 * dc + 0.5, 0, 1), opacity], 1),
+        "POSITION": means - offset,
+        "COLOR_0": np.concatenate([np.clip(sh.C0 * harmonics[:, 0] + 0.5, 0, 1), opacity], 1),
         f"{_NAME}:ROTATION": quats[:, [1, 2, 3, 0]],
         f"{_NAME}:SCALE": scales,
         f"{_NAME}:OPACITY": opacity,
-        f"{_NAME}:SH_DEGREE_0_COEF_0": dc,
     }
-    for degree in (1, 2, 3):
+    for degree in range(4):
         for n in range(2 * degree + 1):
-            found[f"{_NAME}:SH_DEGREE_{degree}_COEF_{n}"] = rest[:, degree * degree - 1 + n]
+            found[f"{_NAME}:SH_DEGREE_{degree}_COEF_{n}"] = harmonics[:, degree * degree + n]
     return {name: values.astype("<f4") for name, values in found.items()}, offset
 
 

@@ -84,6 +84,16 @@ class ExportedGaussians:
     errors: dict[str, float]
     notes: tuple[str, ...]
 
+    def placed(self, world: World) -> tuple[np.ndarray, ...]:
+        """Return the Gaussians in the coordinates that ``world`` maps the scene to, as float64 arrays.
+
+        They are centres (M, 3), standard deviations (M, 3), quaternions wxyz (M, 4), opacities (M,) and SH coefficients
+        of degrees 0 to 3 (M, 16, 3).
+        """
+        gaussians, colours = self.gaussians.to_scene(world), self.colours.rotate(world.rotation)
+        harmonics = torch.cat([colours.dc[:, None], colours.rest], 1)[gaussians.rows]
+        return gaussians.means.numpy(), *gaussians.axes(), gaussians.opacities.numpy(), harmonics.numpy()
+
 
 def fit_exported_gaussians(job: ExportJob) -> ExportedGaussians:
     """Fit Gaussians to a model, of the size that :data:`OPTIONS` choose; raise ConfigError if nothing absorbs light."""
@@ -122,7 +132,7 @@ def fit_exported_gaussians(job: ExportJob) -> ExportedGaussians:
 
 def _write_gaussian_ply(job: ExportJob) -> ExportReport:
     fitted, space = fit_exported_gaussians(job), job.run.channels.color_space
-    rows = _gaussian_ply_rows(fitted.gaussians, fitted.colours, job.run.world)
+    rows = _gaussian_ply_rows(fitted, job.run.world)
     comments = ["3D Gaussian splatting layout, fitted to neural primitives by neuprim (lossy)"]
     comments += [LINEAR] * (space == "linear")
     write_ply(job.out, rows, comments)
@@ -138,16 +148,13 @@ def _write_gaussian_ply(job: ExportJob) -> ExportReport:
     return ExportReport((job.out,), False, fitted.errors, tuple(notes))
 
 
-def _gaussian_ply_rows(gaussians: Gaussians, colours: ExportHarmonics, world: World) -> np.ndarray:
+def _gaussian_ply_rows(fitted: ExportedGaussians, world: World) -> np.ndarray:
     """Return Gaussians as PLY vertices in the user's coordinates. Centres are double if float32 is too coarse."""
-    gaussians, colours = gaussians.to_scene(world.inverse), colours.rotate(world.inverse.rotation)
-    scales, quats = gaussians.axes()
-    opacity = gaussians.opacities.numpy()
-    rest = colours.rest[gaussians.rows].transpose(1, 2).reshape(-1, 45).numpy()
+    means, scales, quats, opacity, harmonics = fitted.placed(world.inverse)
+    rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(-1, 45)
     logit = np.log(opacity) - np.log1p(-opacity)
     zero = np.zeros((len(opacity), 3))
-    dc = colours.dc[gaussians.rows].numpy()
-    table = np.concatenate([gaussians.means, zero, dc, rest, logit[:, None], np.log(scales), quats], axis=1)
+    table = np.concatenate([means, zero, harmonics[:, 0], rest, logit[:, None], np.log(scales), quats], axis=1)
     lost = np.abs(table[:, :3].astype(np.float32) - table[:, :3]).max()
     place = "<f8" if lost > _MAX_ROUNDING * np.ptp(table[:, :3], axis=0).max() else "<f4"
     rows = np.empty(len(table), [(name, place if name in ("x", "y", "z") else "<f4") for name in LAYOUT])

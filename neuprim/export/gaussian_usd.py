@@ -19,6 +19,7 @@ from neuprim.core.errors import BackendUnavailable
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport
 from neuprim.core.task import API_VERSION
 from neuprim.export.gaussian_ply import OPTIONS, ExportedGaussians, fit_exported_gaussians
+from neuprim.export.shared import y_is_up
 
 _REACH = 3.0  # standard deviations that the stated extent contains
 
@@ -29,9 +30,8 @@ def _write_gaussian_usd(job: ExportJob) -> ExportReport:
     frames = job.frames(several=True)
     numbers = frame_numbers(job.run.header, frames)
     matrix = job.run.world.world_from_scene.double()
-    up = matrix[:3, :3] @ job.run.world.up
     stage = Usd.Stage.CreateNew(str(job.out))
-    UsdGeom.SetStageUpAxis(stage, "Y" if abs(up[1]) > abs(up[2]) else "Z")
+    UsdGeom.SetStageUpAxis(stage, "Y" if y_is_up(matrix[:3, :3] @ job.run.world.up) else "Z")
     prim = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/gaussians")
     stage.SetDefaultPrim(prim.GetPrim())
     prim.AddTranslateOp().Set(Gf.Vec3d(*matrix[:3, 3].tolist()))
@@ -66,10 +66,8 @@ def _set_gaussians(prim: Any, fitted: ExportedGaussians, world: World, when: Any
     """Set the attributes of a ParticleField3DGaussianSplat at a time; ``world`` maps the scene to the stage."""
     from pxr import Vt
 
-    gaussians, colours = fitted.gaussians.to_scene(world), fitted.colours.rotate(world.rotation)
-    scales, quats = gaussians.axes()
-    places = (gaussians.means - world.scene_from_world[:3, 3]).numpy()
-    harmonics = np.concatenate([colours.dc[gaussians.rows].numpy()[:, None], colours.rest[gaussians.rows].numpy()], 1)
+    means, scales, quats, opacities, harmonics = fitted.placed(world)
+    places = means - world.scene_from_world[:3, 3].numpy()
     reach = _REACH * scales.max(1, keepdims=True)
 
     def vectors(values: np.ndarray) -> Any:
@@ -79,8 +77,7 @@ def _set_gaussians(prim: Any, fitted: ExportedGaussians, world: World, when: Any
     prim.CreateScalesAttr().Set(vectors(scales), when)
     orientations = np.ascontiguousarray(quats[:, [1, 2, 3, 0]], np.float32)  # stored as xyzw
     prim.CreateOrientationsAttr().Set(Vt.QuatfArray.FromNumpy(orientations), when)
-    opacities = np.ascontiguousarray(gaussians.opacities.numpy(), np.float32)
-    prim.CreateOpacitiesAttr().Set(Vt.FloatArray.FromNumpy(opacities), when)
+    prim.CreateOpacitiesAttr().Set(Vt.FloatArray.FromNumpy(opacities.astype(np.float32)), when)
     prim.CreateRadianceSphericalHarmonicsCoefficientsAttr().Set(vectors(harmonics), when)
     prim.CreateExtentAttr().Set(vectors(np.stack([(places - reach).min(0), (places + reach).max(0)])), when)
 

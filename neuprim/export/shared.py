@@ -20,6 +20,12 @@ from neuprim.core.model.fields import Conditions
 Z_UP_TO_GLTF = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """(4, 4) rotation from axes with z up to glTF's axes with y up: (x, y, z) becomes (x, z, -y)."""
 
+
+def y_is_up(up: Tensor) -> bool:
+    """Return whether an upward direction (3,) is closer to y than to z: USD and glTF know only these axes."""
+    return abs(float(up[1])) > abs(float(up[2]))
+
+
 _DEGREE = 3
 _DIRECTIONS = 64
 _VIEWS, _SIZE = 8, 160

@@ -8,8 +8,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from torch import Tensor
 
 from neuprim.core.io.files import write_text
+from neuprim.export.shared import y_is_up
 
 _ASSET = """
     rel field:{prim} = </volume/{prim}>
@@ -27,10 +29,10 @@ def write_usd_volume(
     files: Mapping[int, Path],
     grids: Sequence[str],
     boxes: Sequence[np.ndarray],
-    up: np.ndarray,
+    up: Tensor,
     rate: float | None,
 ) -> None:
-    """Write the text file ``path`` (.usda), atomically. It refers to files beside it by relative paths.
+    """Write the text file ``path`` (.usda), atomically. It refers to files in its folder by relative paths.
 
     Args:
         files: frame number -> .vdb file, in the folder of ``path``. With one file, the volume does not change in time.
@@ -39,7 +41,7 @@ def write_usd_volume(
         up: (3,) upward direction in these coordinates. USD knows y and z only; the larger of the two is written.
         rate: frames per second; None leaves USD's default, 24.
     """
-    head = ['defaultPrim = "volume"', f'upAxis = "{"Y" if abs(up[1]) > abs(up[2]) else "Z"}"']
+    head = ['defaultPrim = "volume"', f'upAxis = "{"Y" if y_is_up(up) else "Z"}"']
     if rate is not None:
         head += [f"framesPerSecond = {rate:g}", f"timeCodesPerSecond = {rate:g}"]
     if len(files) == 1:

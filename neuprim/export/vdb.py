@@ -147,7 +147,7 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
         )
     if job.flag("usd"):
         files = {frame.number: path for frame, path in zip(frames, paths, strict=True)}
-        up = scene_from_world[:3, :3].T @ job.run.world.up.numpy()
+        up = torch.from_numpy(scene_from_world[:3, :3].T) @ job.run.world.up
         stage = job.out / "density.usda"
         write_usd_volume(stage, files, names, boxes, up, job.number("fps", 0.1, 240.0))
         paths.append(stage)

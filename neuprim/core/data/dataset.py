@@ -257,7 +257,7 @@ class PointSamples:
     points: Tensor  # (M, 3) float32, scene units
     sigma: Tensor  # (M,) float32 extinction, 1/scene unit
     source: Tensor | None  # (M, C) float32 extinction times isotropic source radiance; None trains the extinction only
-    sigma_scale: float  # typical sigma inside matter; the loss divides errors of sigma by it plus sigma
+    sigma_scale: float  # typical sigma inside matter; the loss divides errors of sigma by it
     source_scale: float = 1.0  # typical source inside matter; the loss divides errors of source by it
     components: Mapping[str, tuple[Tensor, float]] = field(default_factory=dict)  # grid -> (M,) part of sigma, scale
     # (M, C) float32 extinction times the radiance that is scattered per irradiance of an unoccluded light; None trains

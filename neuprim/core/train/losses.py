@@ -168,10 +168,10 @@ class PointLossResult:
 def point_loss(model: Primitives, samples: PointSamples, settings: TrainSettings, threads: int = 0) -> PointLossResult:
     """Return the loss of a model's extinction and source radiance against known values at points.
 
-    The loss sums mean squared errors, each error divided by its scale. Beside images, squared errors of the extinction
-    are also divided by 1 + extinction/scale, because images do not show what lies deep in dense matter. Weights: 1 for
-    the extinction, a small one for each extinction component, ``train.voxel_colour`` for the source radiance and for
-    the scattered radiance.
+    The loss sums mean squared errors, each error divided by its scale. With ``train.supervision=both``, squared errors
+    of the extinction are also divided by 1 + extinction/scale: images do not show what lies deep in dense matter.
+    Weights: 1 for the extinction, a small one for each extinction component, ``train.voxel_colour`` for the source
+    radiance and for the scattered radiance.
     """
     colour = samples.source is not None and settings.voxel_colour > 0
     found = volume_values_at(model, samples.conditions, samples.points, colour, threads)

@@ -39,8 +39,9 @@ from neuprim.tasks.dynamic import vdb_recording_of
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.capture_dataset import light_conditions
 from neuprim.tasks.dynamic.volume.lit_medium import light_medium
+from neuprim.tasks.dynamic.volume.medium import Medium
 from neuprim.tasks.dynamic.volume.optics import Light
-from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
+from neuprim.tasks.dynamic.volume.raymarch import render_medium
 
 RECORD = RESULTS / "multiple_scattering.json"
 LIGHTS, OCTAVES, TRAINED = 4, (1, 2, 3, 4), (1, 2, 3)
@@ -62,8 +63,8 @@ def trace_medium(
     import mitsuba  # only where it is needed: tables are made without it
 
     mitsuba.set_variant("scalar_rgb")
-    sigma, scattered = medium.values[..., :1], medium.scattered
-    assert scattered is not None
+    assert medium.scattered is not None and medium.bricks.dense
+    sigma, scattered = medium.values[0, ..., :1], medium.scattered[0]
     albedo = np.where(sigma > 0, scattered / np.where(sigma > 0, sigma, 1), 0)
     place = np.diag([*map(float, sigma.shape[:3]), 1.0])
     place[:3, 3] = -0.5  # the unit cube of a grid ends at the faces of its voxels

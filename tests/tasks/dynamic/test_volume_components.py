@@ -106,7 +106,7 @@ def test_flames_beyond_the_density_and_on_other_voxels_absorb(other: float, tmp_
         cell = abs(np.linalg.det(medium.scene_from_index[:3, :3]))
         flames = (medium.values[..., 0] - medium.scattering).sum() * cell
         assert flames == pytest.approx(expected, rel=0.02), frame.path.name
-        filled = np.argwhere(medium.values[..., 0] > 1).T
+        filled = np.argwhere(medium.values[0, ..., 0] > 1).T
         corners = medium.scene_from_index[:3, :3] @ filled + medium.scene_from_index[:3, 3:]
         assert (corners.min(1) >= capture.bounds[0]).all() and (corners.max(1) <= capture.bounds[1]).all()
 

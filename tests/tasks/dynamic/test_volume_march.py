@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
+from neuprim.tasks.dynamic.volume.medium import Medium
+from neuprim.tasks.dynamic.volume.raymarch import render_medium
 from tests.tasks.dynamic.volumes import box, camera, grey, march_slowly, ragged, sheet
 
 
@@ -23,7 +24,7 @@ def layers(sigma: list[float], colors: list[float], side: float = 1.0) -> tuple[
     n = len(sigma)
     profile = np.tile(np.array(sigma), (n, n, 1))
     values = np.stack([profile, *[profile * np.array(colors)] * 3], -1).astype(np.float32)
-    return Medium.padded(values, box((n, n, n))), side / n
+    return Medium.dense(values, box((n, n, n))).padded(), side / n
 
 
 @pytest.mark.parametrize("sigma", [0.01, 1.0, 20.0, 300.0])
@@ -41,7 +42,7 @@ def test_source_without_extinction() -> None:
     n = 8
     values = np.zeros((n, n, n, 4), np.float32)
     values[..., 1:] = 3.0
-    image = render_medium(Medium.padded(values, box((n, n, n))), along_z(), 1)[4, 4]
+    image = render_medium(Medium.dense(values, box((n, n, n))).padded(), along_z(), 1)[4, 4]
     assert image.tolist() == pytest.approx([3.0, 3.0, 3.0, 0.0], rel=1e-5)
 
 
@@ -74,7 +75,7 @@ def test_voxels_from_thick_to_solid(strength: float) -> None:
     rng = np.random.default_rng(1)
     sigma = rng.random((9, 9, 9)) * strength
     values = np.concatenate([sigma[..., None], sigma[..., None] * rng.uniform(0.5, 1.0, (9, 9, 9, 3))], -1)
-    medium = Medium.padded(values.astype(np.float32), box((9, 9, 9)))
+    medium = Medium.dense(values.astype(np.float32), box((9, 9, 9))).padded()
     image, fine = (render_medium(medium, camera((1.6, -1.5, 1.5), 64), 1, subdivisions=n) for n in (1, 8))
     rgb, alpha = image[..., :3], image[..., 3:]
     assert torch.isfinite(image).all() and (rgb <= alpha * (1 + 1e-5)).all() and (rgb >= 0.499 * alpha).all()
@@ -95,7 +96,9 @@ def test_anisotropic_and_sheared_voxels() -> None:
         matrix = extra @ matrix
         index = np.stack(np.meshgrid(*[np.arange(s) for s in shape], indexing="ij"), -1)
         where = index @ matrix[:3, :3].T + matrix[:3, 3]
-        images.append(render_medium(Medium.padded(grey(8.0 * np.exp(-20.0 * (where**2).sum(-1))), matrix), view))
+        images.append(
+            render_medium(Medium.dense(grey(8.0 * np.exp(-20.0 * (where**2).sum(-1))), matrix).padded(), view)
+        )
     assert images[0][..., 3].max() > 0.8
     assert (images[0] - images[1]).abs().max() < 5e-3 and (images[0] - images[2]).abs().max() < 5e-3
 
@@ -107,7 +110,7 @@ def test_empty_space_is_skipped_without_a_trace() -> None:
     for i, j, k in rng.integers(1, 38, (40, 3)):
         values[2 * i, j, k] = 300.0 * rng.random(4)
     view = camera((2.0, 1.0, 1.5), 64)
-    sparse, dense = Medium(values, box((90, 40, 60))), Medium(values, box((90, 40, 60)))
+    sparse, dense = (Medium.dense(values, box((90, 40, 60))) for _ in range(2))
     assert sparse.skips.max() > 5
     dense.__dict__["skips"] = np.zeros_like(sparse.skips)
     a, b = render_medium(sparse, view), render_medium(dense, view)
@@ -117,6 +120,6 @@ def test_empty_space_is_skipped_without_a_trace() -> None:
 def test_nothing() -> None:
     view = camera((2.0, 1.0, 1.5), 7)
     zeros = np.zeros((5, 6, 7, 4), np.float32)
-    padded = (Medium.padded(voxels, np.eye(4)) for voxels in (zeros, zeros[:0]))
-    for medium in (Medium.without_voxels(), *padded, Medium(zeros[:1], np.eye(4))):
+    padded = (Medium.dense(voxels, np.eye(4)).padded() for voxels in (zeros, zeros[:0]))
+    for medium in (Medium.without_voxels(), *padded, Medium.dense(zeros[:1], np.eye(4))):
         assert torch.equal(render_medium(medium, view), torch.zeros(7, 7, 4))

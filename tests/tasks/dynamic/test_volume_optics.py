@@ -16,8 +16,9 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import list_vdb_files, read_grid, vdb_scale_transform, write_vdb
 from neuprim.tasks.dynamic.volume.capture import hemisphere_capture_cameras
 from neuprim.tasks.dynamic.volume.lit_medium import LitMedium, build_medium, light_medium
+from neuprim.tasks.dynamic.volume.medium import Medium
 from neuprim.tasks.dynamic.volume.optics import OPTICS_PRESETS, Axis, Light, Optics, black_body_rgb, black_body_xyz
-from neuprim.tasks.dynamic.volume.raymarch import Medium, light_transmittance, point_transmittance, render_medium
+from neuprim.tasks.dynamic.volume.raymarch import light_transmittance, point_transmittance, render_medium
 from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation
 from tests.tasks.dynamic.volumes import grid_of, march_slowly, ragged, rotation
 
@@ -44,16 +45,16 @@ def test_black_body_chromaticity(kelvin: float, x: float, y: float) -> None:
 @pytest.mark.parametrize("seed", range(2))
 def test_transmittance_against_brute_force(seed: int) -> None:
     medium = ragged(seed, (6, 8, 7), 20.0)
-    medium = Medium(medium.values, rotation(seed) @ medium.scene_from_index)
+    medium = dataclasses.replace(medium, scene_from_index=rotation(seed) @ medium.scene_from_index)
     direction = np.array([(0.3, -0.5, 0.8), (0.0, 1.0, 0.0)][seed])
-    found = light_transmittance(medium, (2 * direction).tolist())
-    filled = np.argwhere(medium.values[..., 0] > 0)[::7]
+    found, sigma = light_transmittance(medium, (2 * direction).tolist())[0], medium.values[0, ..., 0]
+    filled = np.argwhere(sigma > 0)[::7]
     # a pixel whose ray starts at the voxel and runs to the light
     for voxel in filled[:12]:
         start = medium.scene_from_index[:3, :3] @ voxel + medium.scene_from_index[:3, 3]
         alpha = _alpha(medium, start, direction / np.linalg.norm(direction))
         assert found[tuple(voxel)] == pytest.approx(1 - alpha, abs=2e-3)
-    assert (found[medium.values[..., 0] == 0] == 1).all()
+    assert (found[sigma == 0] == 1).all()
 
 
 def _alpha(medium: Medium, start: np.ndarray, direction: np.ndarray) -> float:
@@ -74,8 +75,8 @@ def test_the_equation_of_a_look() -> None:
     def value(**settings: object) -> list[float]:
         optics = Optics(extinction=4.0, **settings)  # type: ignore[arg-type]
         found = light_medium(build_medium(grids, optics, SAME), optics.light, optics)
-        assert found.values.shape == (3, 3, 3, 4)
-        return found.values[1, 1, 1].tolist()
+        assert found.values.shape == (1, 3, 3, 3, 4)
+        return found.values[0, 1, 1, 1].tolist()
 
     assert value() == [2.0, 0.0, 0.0, 0.0]
     assert value(albedo=(0.5, 0.25, 1.0), ambient=(1.0, 2.0, 3.0)) == [2.0, 1.0, 1.0, 6.0]
@@ -127,7 +128,9 @@ def test_flames_light_the_smoke() -> None:
     flames[1, 1, 1], smoke[7, 1, 1] = 1.0, 1e-3
     grids = {"flames": grid_of("flames", flames), "density": grid_of("density", smoke)}
     look = Optics(extinction=1.0, albedo=(0.5, 0.5, 0.5), emission=2.0, flame_extinction=1e-3, kelvin=(1000.0, 2000.0))
-    plain, lit = (build_medium(grids, dataclasses.replace(look, fire_lights=n), SAME).values[..., 1:] for n in (0, 4))
+    plain, lit = (
+        build_medium(grids, dataclasses.replace(look, fire_lights=n), SAME).values[0, ..., 1:] for n in (0, 4)
+    )
     light, change = 1e-3 * 2.0 * black_body_rgb(np.array(2000.0), 2000.0), lit - plain
     assert change[7, 1, 1] == pytest.approx(0.5 * 1e-3 * light / (4 * math.pi * (36 + 0.25)), rel=3e-3)
     change[7, 1, 1] = 0
@@ -158,11 +161,12 @@ def test_transmittance_to_a_point() -> None:
     turned = 0.25 * rotation(3)[:3, :3]
     scene_from_index = np.eye(4)
     scene_from_index[:3, :3], scene_from_index[:3, 3] = turned, (1.0, -2.0, 0.5)
-    medium = Medium(np.concatenate([sigma[..., None], np.zeros((*sigma.shape, 3), np.float32)], -1), scene_from_index)
+    values = np.concatenate([sigma[..., None], np.zeros((*sigma.shape, 3), np.float32)], -1)
+    medium = Medium.dense(values, scene_from_index)
     some = np.argwhere(sigma > 0)[::29]
     for index in ((4.3, 3.7, 5.1), (4.0, 4.0, 4.0), (-30.0, 12.0, 5.0)):
         place = (scene_from_index @ [*index, 1.0])[:3]
-        found = point_transmittance(medium, place)[tuple(some.T)]
+        found = point_transmittance(medium, place)[0][tuple(some.T)]
         steps = (np.arange(4000) + 0.5) / 4000
         for voxel, transmittance in zip(some, found, strict=True):
             way = np.array(index) - voxel
@@ -214,7 +218,7 @@ def test_grids_of_other_resolutions_meet_in_the_world() -> None:
     assert np.abs(a.values - b.values)[..., 0].max() < 0.003 * a.values[..., 0].max()
     tall = Optics(gradient=((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)), ambient=(1.0, 1.0, 1.0), color_grid="color")
     high = build_medium({"density": density}, tall, CaptureNormalisation((0.5, 0.5, 0.5), 1.0).matrix()).values[
-        12, 12, 1:-1
+        0, 12, 12, 1:-1
     ]
     assert np.allclose(high[:, 3] / high[:, 0], where[0], atol=1e-5)
     assert np.allclose(high[:, 1] / high[:, 0], 1 - where[0], atol=1e-5)

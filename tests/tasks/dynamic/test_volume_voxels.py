@@ -76,9 +76,9 @@ def test_points_are_voxel_centres_with_the_files_own_values(files: Path, tmp_pat
             index = samples.points.double().numpy() @ medium.index_from_scene[:3, :3].T + medium.index_from_scene[:3, 3]
             assert np.abs(index - np.rint(index)).max() < 1e-3
             cells = np.rint(index).astype(int)
-            inside = ((cells >= 0) & (cells < medium.values.shape[:3])).all(1)
+            inside = ((cells >= 0) & (cells < medium.bricks.shape)).all(1)
             expected = np.zeros((len(cells), 4), np.float32)
-            expected[inside] = medium.values[tuple(cells[inside].T)]
+            expected[inside] = medium.values[0][tuple(cells[inside].T)]
             assert np.array_equal(samples.sigma.numpy(), expected[:, 0])
             assert samples.source is not None
             assert np.allclose(samples.source.numpy(), expected[:, 1:] / data.exposure)
@@ -100,11 +100,11 @@ def test_under_several_lights_points_have_emission_and_albedo(files: Path, tmp_p
     assert medium.scattered is not None and light is not None
     index = samples.points.double().numpy() @ medium.index_from_scene[:3, :3].T + medium.index_from_scene[:3, 3]
     cells = np.rint(index).astype(int)
-    inside = ((cells >= 0) & (cells < medium.values.shape[:3])).all(1)
+    inside = ((cells >= 0) & (cells < medium.bricks.shape)).all(1)
     where = tuple(cells[inside].T)
     assert samples.source is not None and samples.scattered is not None
-    assert np.allclose(samples.source[inside].numpy(), medium.values[where][:, 1:] / data.exposure)
-    scattered = medium.scattered[where] / (4 * math.pi * data.exposure)
+    assert np.allclose(samples.source[inside].numpy(), medium.values[0][where][:, 1:] / data.exposure)
+    scattered = medium.scattered[0][where] / (4 * math.pi * data.exposure)
     assert np.allclose(samples.scattered[inside].numpy(), scattered, rtol=1e-5) and scattered.max() > 0
     assert not samples.scattered[~inside].any()
     irradiance = sum(light.irradiance) / 3

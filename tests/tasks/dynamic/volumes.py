@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.io.vdb import VdbGrid
-from neuprim.tasks.dynamic.volume.raymarch import Medium
+from neuprim.tasks.dynamic.volume.medium import Medium
 
 
 def camera(
@@ -48,7 +48,7 @@ def ragged(seed: int, shape: tuple[int, int, int] = (7, 9, 8), strength: float =
     rng = np.random.default_rng(seed)
     sigma = rng.random(shape) * strength * (rng.random(shape) > 0.5)
     values = np.concatenate([sigma[..., None], sigma[..., None] * rng.random((*shape, 3))], -1).astype(np.float32)
-    return Medium.padded(values, box(shape))
+    return Medium.dense(values, box(shape)).padded()
 
 
 def sheet(seed: int, size: int = 32) -> Medium:
@@ -60,7 +60,7 @@ def sheet(seed: int, size: int = 32) -> Medium:
     flame = np.maximum(1.0 - np.abs(where @ normal), 0.0) * inside
     color = 0.05 + flame[..., None] * np.array([1.0, 0.3, 0.03])
     values = np.concatenate([gas[..., None], gas[..., None] * color], -1)
-    return Medium.padded(values.astype(np.float32), box((size,) * 3))
+    return Medium.dense(values.astype(np.float32), box((size,) * 3)).padded()
 
 
 def rays(view: Camera, samples: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -86,7 +86,7 @@ def march_slowly(
     for first in range(0, steps, 400):
         t = near + step * (np.arange(first, first + 400) + 0.5)
         points = (origin + flat[:, None] * t[:, None]) @ inverse[:3, :3].T + inverse[:3, 3]
-        channels = np.moveaxis(medium.values, -1, 0).astype(float)
+        channels = np.moveaxis(medium.values[0], -1, 0).astype(float)
         values = (ndimage.map_coordinates(channel, points.reshape(-1, 3).T, order=1) for channel in channels)
         sigma, *source = (v.reshape(len(flat), -1) for v in values)
         depth = sigma * step

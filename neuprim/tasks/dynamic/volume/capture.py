@@ -32,8 +32,8 @@ from neuprim.core.volumes.density_truth import (
     GridExtent,
 )
 from neuprim.tasks.dynamic.volume.lit_medium import LitMedium, build_medium, draw_lights
+from neuprim.tasks.dynamic.volume.medium import Medium
 from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Light, Optics
-from neuprim.tasks.dynamic.volume.raymarch import Medium
 from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation, GridReader
 
 RENDERER_VERSION = 3
@@ -180,21 +180,21 @@ class Capture:
         """
         medium = self.medium(frame)
         lights = self.frame_lights(frame)
-        media = {light: LitMedium.of(medium, light, self.optics) for light in dict.fromkeys(lights)}
-        brightest = 0.0
-        for c, (camera, light) in enumerate(zip(self.cameras, lights, strict=True)):
-            rgba = media[light].render(camera, self.samples)
-            peak = float(rgba[..., :3].max().half())  # as stored: values that half floats round to 0 are no light
-            if not np.isfinite(peak):
-                raise DataError(
-                    f"{frame.path}: "
-                    f"a radiance of {float(rgba[..., :3].max()):.3g} does not fit the images' half floats; "
-                    "expected at most 65504; lower scene.optics.emission, scene.optics.ambient or scene.optics.light"
-                )
-            brightest = max(brightest, peak)
-            write_exr(folder / f"cam_{c:02d}.exr", rgba, half=True)
         largest = np.float32(medium.values[..., 0].max(initial=0.0))
-        points = _sample_medium_points(media[lights[0]].mean, frame.number)
+        points: dict[str, Any] = {}
+        brightest = 0.0
+        for light in dict.fromkeys(lights):  # one lit medium at a time is in memory
+            lit = LitMedium.of(medium, light, self.optics)
+            points = points or _sample_medium_points(lit.mean, frame.number)
+            for c in (c for c, own in enumerate(lights) if own == light):
+                rgba = lit.render(self.cameras[c], self.samples)
+                peak = float(rgba[..., :3].max().half())  # as stored: values that half floats round to 0 are no light
+                if not np.isfinite(peak):
+                    found = f"a radiance of {float(rgba[..., :3].max()):.3g} does not fit the images' half floats"
+                    settings = "scene.optics.emission, scene.optics.ambient or scene.optics.light"
+                    raise DataError(f"{frame.path}: {found}; expected at most 65504; lower {settings}")
+                brightest = max(brightest, peak)
+                write_exr(folder / f"cam_{c:02d}.exr", rgba, half=True)
         np.savez(folder / LAST_FILE, brightest=np.float32(brightest), largest=largest, **points)
 
 
@@ -204,15 +204,15 @@ def _sample_medium_points(medium: Medium, seed: int) -> dict[str, Any]:
     Return "means" (M, 3), scene units, "colors" (M, 3), radiance, and "weight", the integral of the extinction.
     """
     generator = np.random.default_rng(seed)
-    sigma = medium.values[..., 0]
+    sigma = medium.bricks.without_shared(medium.values[..., 0])
     total = float(sigma.sum(dtype=np.float64))
     if total <= 0:
         return {"means": np.zeros((0, 3), np.float32), "colors": np.zeros((0, 3), np.float32), "weight": np.float64(0)}
     cumulative = np.cumsum(sigma.ravel(), dtype=np.float64)
     flat = np.searchsorted(cumulative, generator.random(POINTS) * cumulative[-1], side="right").clip(max=sigma.size - 1)
-    index = np.stack(np.unravel_index(flat, sigma.shape), -1)
-    values = medium.values.reshape(-1, 4)[flat]
-    jittered = index + generator.random((POINTS, 3)) - 0.5
+    chosen = np.unravel_index(flat, sigma.shape)
+    values = medium.values[chosen]
+    jittered = medium.bricks.index(chosen) + generator.random((POINTS, 3)) - 0.5
     means = jittered @ medium.scene_from_index[:3, :3].T + medium.scene_from_index[:3, 3]
     colors = values[:, 1:] / np.maximum(values[:, :1], 1e-12)
     cell = abs(float(np.linalg.det(medium.scene_from_index[:3, :3])))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from scipy import ndimage
 from torch import Tensor
 
 from neuprim.core.errors import DataError
@@ -24,10 +24,11 @@ from neuprim.core.volumes.density_truth import (
 )
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.lit_medium import light_medium
-from neuprim.tasks.dynamic.volume.raymarch import Medium
+from neuprim.tasks.dynamic.volume.medium import Medium
 
 THIRDS = ("early", "middle", "late")
 _COMPARED_PER_THIRD = 3  # frames
+_MOST_POINTS = 2**27  # of a frame; of larger boxes, every second, third, ... voxel along each axis is compared
 
 
 def sample_extinction(
@@ -38,13 +39,10 @@ def sample_extinction(
     ``scene_from_index`` (4, 4) maps the grid's indices to scene coordinates. With ``part``, the result is only the
     contribution of the extinction grid, without flames.
     """
-    if medium.values.size == 0:
-        return np.zeros(shape, np.float32)
-    chain = np.linalg.inv(medium.scene_from_index) @ scene_from_index.numpy()
+    chain = medium.index_from_scene @ scene_from_index.numpy()
     sigma = medium.scattering if part and medium.scattering is not None else medium.values[..., 0]
-    points = chain[:3, :3] @ np.indices(shape, dtype=np.float64).reshape(3, -1) + chain[:3, 3:]
-    values: np.ndarray = ndimage.map_coordinates(sigma, points, order=1, mode="constant", cval=0.0)
-    return values.reshape(shape).astype(np.float32)
+    points = np.indices(shape, dtype=np.float64).reshape(3, -1).T @ chain[:3, :3].T + chain[:3, 3]
+    return medium.bricks.sample(sigma, points).reshape(shape)
 
 
 class CaptureDensity(DensityGridSource):
@@ -86,12 +84,16 @@ class CaptureDensity(DensityGridSource):
         medium = self.medium(frame)
         if medium.empty:
             return None
-        inside = np.array(medium.values.shape[:3]) - 2.0  # without the empty layer around it
+        inside = np.array(medium.bricks.shape) - 2.0  # without the empty layer around it
         ends = np.stack(np.meshgrid(*np.stack([np.ones(3), inside], -1), indexing="ij"), -1).reshape(-1, 3)
         corners = ends @ medium.scene_from_index[:3, :3].T + medium.scene_from_index[:3, 3]
         low, high = self.bounds.numpy()
         box = np.stack([np.minimum(corners.min(0), low), np.maximum(corners.max(0), high)])
-        return voxels_in_box(box, medium.scene_from_index)
+        matrix, shape = voxels_in_box(box, medium.scene_from_index)
+        every = math.ceil((math.prod(shape) / _MOST_POINTS) ** (1 / 3))
+        matrix[:3, :3] *= every
+        x, y, z = (-(-n // every) for n in shape)
+        return matrix, (x, y, z)
 
     def grid(
         self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None
@@ -108,9 +110,7 @@ class CaptureDensity(DensityGridSource):
             return None
         if capture.lights == 1:
             medium = light_medium(medium, capture.frame_lights(self._files[frame])[0], capture.optics)
-        index = np.argwhere(medium.values[..., 0] > 0)
-        where = tuple(index.T)
-        points = index @ medium.scene_from_index[:3, :3].T + medium.scene_from_index[:3, 3]
+        points, where = medium.voxels(medium.values[..., 0] > 0)
         scattered = None if capture.lights == 1 or medium.scattered is None else medium.scattered[where]
         return VoxelLook(points, medium.values[where][:, 1:], scattered)
 
@@ -121,11 +121,11 @@ class CaptureDensity(DensityGridSource):
 def compare_capture_extinction(model: Primitives, capture: Capture, times: list[float]) -> dict[str, Any]:
     """Measure a model's errors of extinction (sigma) against the .vdb files of a sequence; return name -> value.
 
-    All voxels of the sequence's box are compared. ``times`` has the time of every frame. "sigma_frames" has the errors
-    of each compared frame, see :func:`~neuprim.core.volumes.density_truth.measure_density_errors`. There are also means
-    over the early, middle and late third of the sequence, each over three evenly spaced frames. Frames without
-    extinction are left out. If flames add to the extinction of a grid, the errors of that grid's part are also
-    measured: "density_frames", ...
+    All voxels of the sequence's box are compared; of boxes of more than 2^27 voxels, an evenly spaced part. ``times``
+    has the time of every frame. "sigma_frames" has the errors of each compared frame, see
+    :func:`~neuprim.core.volumes.density_truth.measure_density_errors`. There are also means over the early, middle and
+    late third of the sequence, each over three evenly spaced frames. Frames without extinction are left out. If flames
+    add to the extinction of a grid, the errors of that grid's part are also measured: "density_frames", ...
     """
     result: dict[str, Any] = {}
     count, truth, compared = len(capture.frames), CaptureDensity(capture), 3 * _COMPARED_PER_THIRD

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -21,7 +22,7 @@ from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.lit_medium import light_medium
-from neuprim.tasks.dynamic.volume.raymarch import Medium
+from neuprim.tasks.dynamic.volume.medium import Medium
 
 T = TypeVar("T")
 
@@ -83,17 +84,31 @@ class MediumVoxels:
     @staticmethod
     def of(medium: Medium, lit: bool = False) -> MediumVoxels:
         """Return the voxels of a medium that have a non-zero value; if ``lit``, with their albedo."""
-        flat = medium.values.reshape(-1, 4)
+        bricks = medium.bricks
+        columns = [medium.values]
         if medium.scattering is not None:
-            flat = np.concatenate([flat, medium.scattering.reshape(-1, 1)], 1)
+            columns.append(medium.scattering[..., None])
         if lit:
-            scattered = np.zeros((len(flat), 3), np.float32) if medium.scattered is None else medium.scattered
-            flat = np.concatenate([flat, scattered.reshape(-1, 3)], 1)
-        index = np.flatnonzero(flat.any(1))
-        x, y, z = medium.values.shape[:3]
-        return MediumVoxels(
-            index.astype(np.int64), np.ascontiguousarray(flat[index]), (x, y, z), medium.scene_from_index
-        )
+            nothing = np.broadcast_to(np.float32(0), (*medium.values.shape[:4], 3))
+            columns.append(nothing if medium.scattered is None else medium.scattered)
+        parts = [(np.zeros(0, np.int64), np.zeros((0, sum(column.shape[-1] for column in columns)), np.float32))]
+        # bricks of one layer at a time, so that only the voxels of a layer must be sorted
+        ends = np.flatnonzero(np.diff(bricks.origins[:, 0], append=-1)) + 1
+        for first, last in itertools.pairwise([0, *ends.tolist()]):
+            some = [column[first:last] for column in columns]
+            filled = np.any([column.any(-1) for column in some], 0)
+            if bricks.dense:
+                index = np.flatnonzero(filled)
+                rows = [column.reshape(-1, column.shape[-1])[index] for column in some]
+            else:
+                block, *cells = bricks.select(filled)
+                index = np.ravel_multi_index(tuple(bricks.index((block + first, *cells)).T), bricks.shape)
+                order = np.argsort(index)
+                index = index[order]
+                rows = [column[tuple(axis[order] for axis in (block, *cells))] for column in some]
+            parts.append((index, np.concatenate(rows, 1)))
+        index, values = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+        return MediumVoxels(index, values, bricks.shape, medium.scene_from_index)
 
     @property
     def has_part(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,16 +15,20 @@ from neuprim.core.cameras import Camera
 from neuprim.core.errors import DataError, nearest
 from neuprim.core.io.vdb import DENSE_LIMIT, Bounds, VdbGrid
 from neuprim.tasks.dynamic.scattering import octaves_of_light, phase_factor, scattered_light
-from neuprim.tasks.dynamic.volume.optics import Light, Optics, black_body_rgb
-from neuprim.tasks.dynamic.volume.raymarch import (
-    NOT_FINITE,
+from neuprim.tasks.dynamic.volume.medium import (
+    EDGE,
+    Bricks,
     Medium,
-    light_transmittance,
-    point_transmittance,
-    render_medium,
+    bricks_with_voxels,
+    grid_boxes,
+    pad_voxels,
+    read_bricks,
 )
+from neuprim.tasks.dynamic.volume.optics import Light, Optics, black_body_rgb
+from neuprim.tasks.dynamic.volume.raymarch import light_transmittance, point_transmittance, render_medium
 
-_ONE_AROUND = ((1, 1), (1, 1), (1, 1), (0, 0))  # the layer of empty voxels that Medium.padded adds
+_DENSE_VOXELS = 2**25  # of a box that is always stored densely; 512 MB
+_VOXEL_BYTES = 16  # four numbers
 _BLACK_BODY_STEPS = 1024  # entries of the table of black bodies; linear between them
 
 
@@ -56,23 +60,30 @@ def build_medium(grids: Mapping[str, VdbGrid], optics: Optics, scene_from_world:
         box = _unite_medium_boxes(box, _transform_medium_bounds(flames, base.transform))
     if box is None:
         return Medium.without_voxels()
-    sigma_s = _sample_medium_grid(base, base.transform, box) * np.float32(optics.extinction)
-    flame = None if flames is None else _sample_medium_grid(flames, base.transform, box)
+    absorbing = [base] if flames is None or optics.flame_extinction == 0.0 else [base, flames]
+    voxels = _MediumGrid.of(absorbing, base.transform, box)
+    sigma_s = voxels.sample(base) * np.float32(optics.extinction)
+    flame = None if flames is None else voxels.sample(flames)
     sigma = sigma_s if flame is None else sigma_s + flame * np.float32(optics.flame_extinction)
     values = np.zeros((*sigma.shape, 4), np.float32)
     values[..., 0] = sigma
     scene_from_index = scene_from_world @ base.transform
-    scene_from_index[:3, 3] += scene_from_index[:3, :3] @ np.array(box[0], np.float64)
-    scattered = sigma_s[..., None] * _scattering_albedo(grids, optics, base.transform, box, scene_from_index)
-    values[..., 1:] = scattered * np.array(optics.ambient, np.float32)
+    scene_from_index[:3, 3] += scene_from_index[:3, :3] @ voxels.first
+    scattered = sigma_s[..., None] * _scattering_albedo(grids, optics, voxels, scene_from_index)
+    for c, ambient in enumerate(optics.ambient):
+        values[..., 1 + c] = scattered[..., c] * np.float32(ambient)
     mixed = sigma_s if optics.mixes(grids) else None
-    if flame is None or optics.emission == 0.0:
-        return Medium.padded(values, scene_from_index, mixed, None if optics.light is None else scattered)
-    glow = sigma[..., None] * _flame_radiance(flame, optics)
-    values[..., 1:] += glow
-    medium = Medium.padded(values, scene_from_index, mixed, scattered)
-    lit = medium if optics.fire_lights == 0 else light_by_fire(medium, np.pad(glow, _ONE_AROUND), optics)
-    return lit if optics.light is not None else replace(lit, scattered=None)
+    glow = None
+    if flame is not None and optics.emission > 0.0:
+        glow = sigma[..., None] * _flame_radiance(flame, optics)
+        values[..., 1:] += glow
+    lit_by_fire = glow is not None and optics.fire_lights > 0
+    kept = scattered if optics.light is not None or lit_by_fire else None
+    medium = Medium(values, scene_from_index, voxels.bricks, mixed, kept).padded()
+    if glow is None or not lit_by_fire:
+        return medium
+    medium = light_by_fire(medium, pad_voxels(glow, voxels.bricks), optics)
+    return medium if optics.light is not None else replace(medium, scattered=None)
 
 
 def _transform_medium_bounds(grid: VdbGrid, transform: np.ndarray) -> Bounds | None:
@@ -108,56 +119,148 @@ def _same_voxels(a: np.ndarray, b: np.ndarray) -> bool:
     return same_axes and np.allclose(shift, [0, 0, 0, 1], rtol=0, atol=1e-6)
 
 
-def _sample_medium_grid(grid: VdbGrid, transform: np.ndarray, box: Bounds, channels: int = 1) -> np.ndarray:
-    """Sample a grid at the centres of the voxels in ``box`` (index bounds), trilinearly unless they are its own voxels.
+@dataclass(frozen=True, eq=False)
+class _MediumGrid:
+    """The voxels of a medium before it is padded: those of its extinction grid in a box, densely or in bricks.
 
-    ``transform`` maps indices to the world. The result is (X, Y, Z) float32, or (X, Y, Z, 3) for three channels. Values
-    that are not finite and negative scalars become 0.
+    Attributes:
+        transform: (4, 4) from indices of the extinction grid to the world.
+        box: outside it, all values are 0.
+        first: (3,) int64 index, in the extinction grid, of the first voxel of ``bricks``.
     """
-    if grid.channels != channels:
-        raise DataError(f"grid {grid.name!r} has {grid.channels} channels; expected {channels}")
-    limit = DENSE_LIMIT // 4 * channels  # the medium has four numbers per voxel
-    shape = tuple(h - l for l, h in zip(*box, strict=True))
-    if _same_voxels(grid.transform, transform):
-        values = grid.to_dense(box, limit, 0.0)
-    elif grid.bounds is None:
-        values = np.zeros((*shape, 3)[: 2 + min(channels, 2)], np.float32)
-    else:
+
+    transform: np.ndarray
+    box: Bounds
+    first: np.ndarray
+    bricks: Bricks
+
+    @staticmethod
+    def of(absorbing: Sequence[VdbGrid], transform: np.ndarray, box: Bounds) -> _MediumGrid:
+        """Choose bricks if the box is large and the absorbing grids are almost empty.
+
+        Raises:
+            DataError: the bricks take more memory than :data:`DENSE_LIMIT`, or are too many.
+        """
+        low, high = np.array(box, np.int64)
+        x, y, z = (high - low).tolist()
+        dense = _MediumGrid(transform, box, low, Bricks.whole((x, y, z)))
+        if x * y * z <= _DENSE_VOXELS or any(grid.background.any() for grid in absorbing):
+            return dense
+        sparse = _MediumGrid.in_bricks(absorbing, transform, box)
+        bricks = sparse.bricks
+        size = len(bricks.origins) * math.prod(bricks.block) * _VOXEL_BYTES
+        if size > x * y * z * _VOXEL_BYTES:
+            return dense
+        if size > DENSE_LIMIT:
+            found = f"{len(bricks.origins)} blocks of voxels that are not empty, which take {size} bytes"
+            raise DataError(f"grid {absorbing[0].name!r} has {found}; at most {DENSE_LIMIT} are allowed")
+        return sparse
+
+    @staticmethod
+    def in_bricks(grids: Sequence[VdbGrid], transform: np.ndarray, box: Bounds) -> _MediumGrid:
+        """Return bricks that contain all values of the grids in a box."""
+        low, high = np.array(box, np.int64)
+        first = (low - 1) // EDGE * EDGE
+        boxes = [_transform_boxes(grid_boxes(grid), grid.transform, transform) - first for grid in grids]
+        return _MediumGrid(transform, box, first, Bricks.at(bricks_with_voxels(boxes, high - first)))
+
+    def axes(self) -> list[np.ndarray]:
+        """Return the indices of all voxels relative to ``first``, one array per axis, broadcastable to (B, x, y, z)."""
+        result = []
+        for a, n in enumerate(self.bricks.block):
+            along = np.arange(n).reshape([-1 if a == b else 1 for b in range(3)])
+            result.append(self.bricks.origins[:, a].reshape(-1, 1, 1, 1) + along)
+        return result
+
+    def sample(self, grid: VdbGrid, channels: int = 1) -> np.ndarray:
+        """Sample a grid at the voxels' centres, trilinearly unless they are its own voxels.
+
+        The result is (B, x, y, z) float32, or (B, x, y, z, 3) for three channels. Values that are not finite and
+        negative scalars become 0.
+        """
+        if grid.channels != channels:
+            raise DataError(f"grid {grid.name!r} has {grid.channels} channels; expected {channels}")
+        if self.bricks.dense:
+            values = self._sample_densely(grid)[None]
+        else:
+            values = self._sample_bricks(grid)
+            for a, index in enumerate(self.axes()):
+                outside = (index + self.first[a] < self.box[0][a]) | (index + self.first[a] >= self.box[1][a])
+                values[np.broadcast_to(outside, values.shape[:4])] = 0.0
+        return np.maximum(values, 0.0) if channels == 1 else values
+
+    def _sample_densely(self, grid: VdbGrid) -> np.ndarray:
+        limit = DENSE_LIMIT // 4 * grid.channels  # the medium has four numbers per voxel
+        shape = self.bricks.shape
+        if _same_voxels(grid.transform, self.transform):
+            return grid.to_dense(self.box, limit, 0.0)
+        if grid.bounds is None:
+            return np.zeros((*shape, 3)[: 2 + min(grid.channels, 2)], np.float32)
         around = _make_medium_bounds(np.array(grid.bounds[0]) - 1, np.array(grid.bounds[1]) + 1)
         own = grid.to_dense(around, limit, 0.0)
-        matrix = np.linalg.inv(grid.transform) @ transform
-        offset = matrix[:3, :3] @ np.array(box[0], np.float64) + matrix[:3, 3] - np.array(around[0])
-        planes = [own] if channels == 1 else list(np.moveaxis(own, -1, 0))
+        matrix = np.linalg.inv(grid.transform) @ self.transform
+        offset = matrix[:3, :3] @ np.array(self.box[0], np.float64) + matrix[:3, 3] - np.array(around[0])
+        planes = [own] if grid.channels == 1 else list(np.moveaxis(own, -1, 0))
         settings = (matrix[:3, :3], offset, shape)
         sampled = [ndimage.affine_transform(p, *settings, order=1, mode="grid-constant") for p in planes]
-        values = sampled[0] if channels == 1 else np.stack(sampled, -1)
-    return np.maximum(values, 0.0) if channels == 1 else values
+        return sampled[0] if grid.channels == 1 else np.stack(sampled, -1)
+
+    def _sample_bricks(self, grid: VdbGrid) -> np.ndarray:
+        same = _same_voxels(grid.transform, self.transform)
+        own = self if same or grid.bounds is None else _MediumGrid.in_bricks([grid], grid.transform, grid.bounds)
+        values = read_bricks(grid, own.first, own.bricks)
+        values[~np.isfinite(values)] = 0.0
+        if own is self:
+            return values
+        matrix = np.linalg.inv(grid.transform) @ self.transform
+        found = np.zeros((len(self.bricks.origins), *self.bricks.block, *values.shape[4:]), np.float32)
+        for brick, origin in enumerate(self.bricks.origins):
+            index = (np.indices(self.bricks.block).reshape(3, -1).T + origin + self.first) @ matrix[:3, :3].T
+            points = index + matrix[:3, 3] - own.first
+            for c in np.ndindex(values.shape[4:]):
+                found[(brick, ..., *c)] = own.bricks.sample(values[(..., *c)], points).reshape(self.bricks.block)
+        return found
+
+
+def _transform_boxes(boxes: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return boxes (M, 2, 3) in voxels of another grid, each with one more voxel around; see :func:`grid_boxes`.
+
+    ``source`` and ``target`` are the index-to-world matrices of the two grids.
+    """
+    if _same_voxels(source, target):
+        return boxes
+    chain = np.linalg.inv(target) @ source
+    ends = np.stack([boxes[:, 0] - 1, boxes[:, 1]], 1).astype(np.float64)
+    corners = np.stack([ends[:, [a, b, c], [0, 1, 2]] for a, b, c in np.ndindex(2, 2, 2)], 1)
+    index = corners @ chain[:3, :3].T + chain[:3, 3]
+    return np.stack([np.floor(index.min(1)), np.ceil(index.max(1)) + 1], 1).astype(np.int64)
 
 
 def _scattering_albedo(
-    grids: Mapping[str, VdbGrid], optics: Optics, transform: np.ndarray, box: Bounds, scene_from_index: np.ndarray
+    grids: Mapping[str, VdbGrid], optics: Optics, voxels: _MediumGrid, scene_from_index: np.ndarray
 ) -> np.ndarray:
-    """Return the albedo, times the colour grid or else the colour gradient; broadcastable to (X, Y, Z, 3).
+    """Return the albedo, times the colour grid or else the colour gradient; broadcastable to (B, x, y, z, 3).
 
-    ``transform`` maps the voxel indices in ``box`` to the world; ``scene_from_index`` is relative to the start of
-    ``box``.
+    ``scene_from_index`` is relative to the first of the voxels.
     """
     albedo = np.array(optics.albedo, np.float32)
     if optics.color_grid is not None and optics.color_grid in grids:
-        return albedo * np.clip(_sample_medium_grid(grids[optics.color_grid], transform, box, 3), 0.0, 1.0)
+        return albedo * np.clip(voxels.sample(grids[optics.color_grid], 3), 0.0, 1.0)
     if optics.gradient is None:
         return albedo
     axis = "xyz".index(optics.up)
-    sizes = [h - l for l, h in zip(*box, strict=True)]
-    indices = np.meshgrid(*(np.arange(n) for n in sizes), indexing="ij", sparse=True)
-    height = sum(scene_from_index[axis, a] * indices[a] for a in range(3)) + scene_from_index[axis, 3] + 0.5
+    height = (
+        sum(scene_from_index[axis, a] * index for a, index in enumerate(voxels.axes()))
+        + scene_from_index[axis, 3]
+        + 0.5
+    )
     stops = np.linspace(0.0, 1.0, len(optics.gradient))
     colours = [np.interp(height, stops, [stop[c] for stop in optics.gradient]) for c in range(3)]
     return albedo * np.stack(colours, -1).astype(np.float32)
 
 
 def _flame_radiance(flame: np.ndarray, optics: Optics) -> np.ndarray:
-    """Return the (X, Y, Z, 3) float32 black-body radiance of flames: emission · B(K(flame)), see :class:`Optics`."""
+    """Return the (B, x, y, z, 3) float32 black-body radiance of flames: emission · B(K(flame)), see :class:`Optics`."""
     low, high = optics.flame_range
     table = black_body_rgb(np.linspace(*optics.kelvin, _BLACK_BODY_STEPS), optics.kelvin[1]) * optics.emission
     where = np.clip((flame - low) / (high - low), 0.0, 1.0) * (_BLACK_BODY_STEPS - 1)
@@ -201,14 +304,13 @@ def light_medium(medium: Medium, light: Light | None, optics: Optics) -> Medium:
 
 
 def _add_scattered(medium: Medium, scattered: np.ndarray, light: Light, values: np.ndarray) -> Medium:
-    """Return a medium with ``values`` plus the light that ``medium`` scatters, (X, Y, Z) per unit of irradiance."""
+    """Return a medium with ``values`` plus the light that ``medium`` scatters, (B, x, y, z) per unit of irradiance."""
     assert medium.scattered is not None
     arriving = np.array(light.irradiance, np.float32) / np.float32(4.0 * math.pi)
     found = values.copy()
-    found[..., 1:] += medium.scattered * (scattered[..., None] * arriving)
-    if not np.isfinite(found).all():
-        raise DataError(NOT_FINITE)
-    return replace(medium, values=found)
+    for c in range(3):
+        found[..., 1 + c] += medium.scattered[..., c] * (scattered * arriving[c])
+    return replace(medium, values=found, scattered=None).require_finite()
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,19 +378,17 @@ def light_by_fire(medium: Medium, glow: np.ndarray, optics: Optics) -> Medium:
 
     Args:
         medium: a medium with ``scattered``.
-        glow: (X, Y, Z, 3) σ times the emitted radiance.
+        glow: (B, x, y, z, 3) σ times the emitted radiance.
     """
     assert medium.scattered is not None
-    index = np.argwhere(glow.max(-1) > _FAINT * glow.max(initial=0.0))
-    if not len(index):
+    points, glowing = medium.voxels(glow.max(-1) > _FAINT * glow.max(initial=0.0))
+    if not len(points):
         return medium
     volume = abs(np.linalg.det(medium.scene_from_index[:3, :3]))
-    light = glow[tuple(index.T)].astype(np.float64) * volume
-    points = index @ medium.scene_from_index[:3, :3].T + medium.scene_from_index[:3, 3]
-    voxels = np.argwhere(medium.scattered.max(-1) > 0)
-    lit = tuple(voxels.T)
-    places = voxels @ medium.scene_from_index[:3, :3].T + medium.scene_from_index[:3, 3]
-    arriving = np.zeros((len(voxels), 3))
+    light = glow[glowing].astype(np.float64) * volume
+    lit = np.nonzero(medium.scattered.max(-1) > 0)
+    places = medium.centers(lit)
+    arriving = np.zeros((len(places), 3))
     for cluster in split_lights(points, light.sum(1), optics.fire_lights):
         weights = light[cluster].sum(1) / light[cluster].sum()
         center = weights @ points[cluster]
@@ -297,9 +397,7 @@ def light_by_fire(medium: Medium, glow: np.ndarray, optics: Optics) -> Medium:
         arriving += (found / (np.square(places - center).sum(1) + radius**2))[:, None] * light[cluster].sum(0)
     values = medium.values.copy()
     values[..., 1:][lit] += medium.scattered[lit] * (arriving / (4 * math.pi)).astype(np.float32)
-    if not np.isfinite(values).all():
-        raise DataError(NOT_FINITE)
-    return replace(medium, values=values)
+    return replace(medium, values=values).require_finite()
 
 
 def split_lights(points: np.ndarray, weights: np.ndarray, most: int) -> list[np.ndarray]:

@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,13 +18,12 @@ import torch
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
-from scipy import ndimage
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.compute.kernels import inline, kernel
 from neuprim.core.compute.threads import parallel_for
-from neuprim.core.errors import DataError
+from neuprim.tasks.dynamic.volume.medium import Medium, find_brick
 
 _ROWS_PER_JOB, _SLICES_PER_JOB = 4, 2
 _GAUSS, _FAR = 0.5 - math.sqrt(3.0) / 6.0, 1e30
@@ -36,86 +33,6 @@ _LESS, _MORE = np.float32(math.sqrt(1.0 / 3.0) - 0.5), np.float32(math.sqrt(1.0 
 _TINY, _DARK = np.float32(1e-30), 16.0
 _HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 _C2, _C3, _C4, _C5, _C6, _C7 = (np.float32(1.0 / n) for n in range(2, 8))
-
-
-NOT_FINITE = "medium: values are NaN or infinite; expected finite ones (scene.optics)"
-
-_NEGLIGIBLE = 1e-7  # optical depth across a cell, and share of the strongest source, below which a voxel is empty
-
-
-@dataclass(frozen=True, eq=False)
-class Medium:
-    """Extinction and source of a medium at voxel centres, trilinear in between. A medium may have no voxels.
-
-    The radiance along a ray is L = ∫ T(s) σ(s) c(s) ds with T(s) = exp(-∫₀ˢ σ), and alpha = 1 - T at the ray's end.
-
-    Attributes:
-        values: (X, Y, Z, 4) float32, C-contiguous: σ in 1/scene unit, and σ times the source radiance in linear RGB.
-            The outermost voxels are zero, so that the field is continuous; :meth:`padded` adds that layer.
-        scene_from_index: (4, 4) float64, affine and invertible; maps (i, j, k, 1) to the centre of voxel (i, j, k).
-        scattering: (X, Y, Z) float32, the extinction grid's part of σ; None if flames do not add to σ.
-        scattered: (X, Y, Z, 3) float32, the extinction grid's part of σ times the albedo; None without a light.
-    """
-
-    values: np.ndarray
-    scene_from_index: np.ndarray
-    scattering: np.ndarray | None = None
-    scattered: np.ndarray | None = None
-
-    @staticmethod
-    def padded(
-        values: np.ndarray,
-        scene_from_index: np.ndarray,
-        scattering: np.ndarray | None = None,
-        scattered: np.ndarray | None = None,
-    ) -> Medium:
-        """Build the medium of (X, Y, Z, 4) ``values``, surrounded by one layer of empty voxels.
-
-        Raises:
-            DataError: a value is not finite.
-        """
-        if not np.isfinite(values).all():
-            raise DataError(NOT_FINITE)
-        shift = np.eye(4)
-        shift[:3, 3] = -1.0
-        around = ((1, 1), (1, 1), (1, 1), (0, 0))
-        return Medium(
-            np.pad(values, around),
-            scene_from_index @ shift,
-            None if scattering is None else np.pad(scattering, 1),
-            None if scattered is None else np.pad(scattered, around),
-        )
-
-    @staticmethod
-    def without_voxels() -> Medium:
-        return Medium(np.zeros((0, 0, 0, 4), np.float32), np.eye(4))
-
-    @property
-    def empty(self) -> bool:
-        """Whether the medium has no cell: fewer than two voxels along some axis."""
-        return min(self.values.shape[:3]) < 2
-
-    @cached_property
-    def index_from_scene(self) -> np.ndarray:
-        """(4, 4) float64 inverse of ``scene_from_index``."""
-        return np.linalg.inv(self.scene_from_index)
-
-    @cached_property
-    def skips(self) -> np.ndarray:
-        """Chessboard distance of each cell to the nearest non-empty cell, up to 255; (X-1, Y-1, Z-1) uint8.
-
-        A ray in a cell with distance d crosses the cube around the cell, 2d - 1 cells wide, in one step.
-        """
-        if self.empty:
-            return np.zeros((0, 0, 0), np.uint8)
-        diagonal = float(np.abs(self.scene_from_index[:3, :3]).sum())
-        source = np.abs(self.values[..., 1:]).max(-1)
-        filled = (self.values[..., 0] * diagonal > _NEGLIGIBLE) | (source > _NEGLIGIBLE * float(source.max()))
-        for axis in range(3):  # a cell holds something if one of its eight corners does
-            filled = np.delete(filled, -1, axis) | np.delete(filled, 0, axis)
-        if not filled.any():
-            return np.full(filled.shape, 255, np.uint8)
-        return np.minimum(ndimage.distance_transform_cdt(~filled, "chessboard"), 255).astype(np.uint8)
 
 
 def render_medium(medium: Medium, camera: Camera, samples: int = 2, subdivisions: int = 1) -> Tensor:
@@ -133,13 +50,15 @@ def render_medium(medium: Medium, camera: Camera, samples: int = 2, subdivisions
     pose = (medium.index_from_scene @ np.linalg.inv(camera.viewmat.detach().double().cpu().numpy()))[:3]
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
     image = np.zeros((camera.height, camera.width, 4), np.float32)
+    bricks = medium.bricks
+    voxels = (medium.values, medium.skips, bricks.table, bricks.shift, bricks.cells)
     rays = (np.ascontiguousarray(pose), lens, camera.width, samples, subdivisions)
-    parallel_for(_march_image_rows, camera.height, _ROWS_PER_JOB, 0, medium.values, medium.skips, *rays, image)
+    parallel_for(_march_image_rows, camera.height, _ROWS_PER_JOB, 0, *voxels, *rays, image)
     return torch.from_numpy(image)
 
 
 def light_transmittance(medium: Medium, direction: Sequence[float]) -> np.ndarray:
-    """Return (X, Y, Z) float32 transmittance exp(-∫ σ ds) from voxel centres to a directional light.
+    """Return (B, x, y, z) float32 transmittance exp(-∫ σ ds) from voxel centres to a directional light.
 
     ``direction`` points to the light, on the scene's axes, any length > 0. The transmittance is exact up to rounding.
     Voxels without extinction get 1; no ray is traced from them.
@@ -149,7 +68,7 @@ def light_transmittance(medium: Medium, direction: Sequence[float]) -> np.ndarra
 
 
 def point_transmittance(medium: Medium, position: Sequence[float]) -> np.ndarray:
-    """Return (X, Y, Z) float32 transmittance from voxel centres to a point, given in scene units.
+    """Return (B, x, y, z) float32 transmittance from voxel centres to a point, given in scene units.
 
     The transmittance is exact up to rounding. Voxels without extinction get 1; no ray is traced from them.
     """
@@ -157,18 +76,19 @@ def point_transmittance(medium: Medium, position: Sequence[float]) -> np.ndarray
 
 
 def _transmittance_to(medium: Medium, place: np.ndarray) -> np.ndarray:
-    """Return (X, Y, Z) transmittance from voxel centres to ``place`` (4,), a homogeneous point in scene coordinates.
+    """Return (B, x, y, z) transmittance from voxel centres to ``place`` (4,), a homogeneous point in scene coordinates.
 
     The last number of ``place`` is 1 for a position and 0 for a direction.
     """
-    result = np.zeros(medium.values.shape[:3], np.float32)
+    result, bricks = np.zeros(medium.values.shape[:4], np.float32), medium.bricks
     if not medium.empty:
-        sigma, units = (
-            np.ascontiguousarray(medium.values[..., 0]),
-            np.ascontiguousarray(medium.scene_from_index[:3, :3]),
-        )
+        sigma = np.ascontiguousarray(medium.values[..., 0])
+        units = np.ascontiguousarray(medium.scene_from_index[:3, :3])
+        voxels = (sigma, medium.skips, bricks.table, bricks.shift, bricks.cells, bricks.origins)
+        slices = len(sigma) * bricks.without_shared(sigma).shape[1]
         target = medium.index_from_scene @ place
-        parallel_for(_march_depths, len(sigma), _SLICES_PER_JOB, 0, sigma, medium.skips, target, units, result)
+        parallel_for(_march_depths, slices, _SLICES_PER_JOB, 0, *voxels, target, units, bricks.without_shared(result))
+        bricks.copy_shared(result)
     return np.exp(-result)
 
 
@@ -332,21 +252,26 @@ _two_points: Any = intrinsic(_generate_two_march_points)
 
 
 @kernel
-def _march_image_rows(start, stop, values, skips, pose, lens, width, samples, parts, image):  # type: ignore[no-untyped-def]
+def _march_image_rows(  # type: ignore[no-untyped-def]
+    start, stop, values, skips, table, shift, cells, pose, lens, width, samples, parts, image
+):
     """Render image rows start:stop.
 
     Args:
-        values, skips: attributes of the :class:`Medium` to render.
+        values, skips: attributes of the :class:`~neuprim.tasks.dynamic.volume.medium.Medium` to render.
+        table, shift, cells: attributes of its ``bricks``.
         pose: (3, 4) float64, from camera space (scene units) to indices.
         lens: (4,) float64 fx fy cx cy.
         samples: rays per pixel along each axis of the image.
         parts: sub-intervals per cell.
         image: (H, W, 4) float32, premultiplied RGBA, written.
     """
-    nx, ny, nz = skips.shape
+    nx, ny, nz = cells[0], cells[1], cells[2]
+    mask = (1 << shift) - 1
     flat = values.reshape(-1)
-    dy = np.uint64(4 * (nz + 1))
-    dx = dy * np.uint64(ny + 1)
+    dy = np.uint64(4 * values.shape[3])
+    dx = dy * np.uint64(values.shape[2])
+    block = dx * np.uint64(values.shape[1])
     weight = np.float32(1.0 / (samples * samples))
     share = 1.0 / parts
     ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
@@ -372,14 +297,16 @@ def _march_image_rows(start, stop, values, skips, pose, lens, width, samples, pa
                 through = _ONE
                 r, g, b = _ZERO, _ZERO, _ZERO
                 while 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
-                    skip = int(skips[i, j, k])
+                    brick = find_brick(table, shift, i, j, k)
+                    ci, cj, ck = np.uint64(i & mask), np.uint64(j & mask), np.uint64(k & mask)
+                    skip = int(skips[np.uint64(brick), ci, cj, ck]) if brick >= 0 else -brick
                     reach = max(skip - 1, 0)
                     tx = _march_cell_exit(ox, ix, i, reach)
                     ty = _march_cell_exit(oy, iy, j, reach)
                     tz = _march_cell_exit(oz, iz, k, reach)
                     out = min(tx, min(ty, tz))
                     if skip == 0 and out > t:
-                        o = np.uint64(i) * dx + np.uint64(j) * dy + np.uint64(4 * k)
+                        o = np.uint64(brick) * block + ci * dx + cj * dy + np.uint64(4) * ck
                         step = (out - t) * share
                         part = step
                         begin = t
@@ -424,7 +351,7 @@ def _march_image_rows(start, stop, values, skips, pose, lens, width, samples, pa
 
 @inline
 def _trilinear_march_sample(v, i, j, k, x, y, z):  # type: ignore[no-untyped-def]
-    """Return the trilinear value of the array ``v`` (X, Y, Z) in cell (i, j, k), at the fractions x, y, z of it."""
+    """Return the trilinear value of a block ``v`` (x, y, z) in its cell (i, j, k), at the fractions x, y, z of it."""
     a = v[i, j, k] + z * (v[i, j, k + 1] - v[i, j, k])
     b = v[i, j + 1, k] + z * (v[i, j + 1, k + 1] - v[i, j + 1, k])
     c = v[i + 1, j, k] + z * (v[i + 1, j, k + 1] - v[i + 1, j, k])
@@ -435,23 +362,29 @@ def _trilinear_march_sample(v, i, j, k, x, y, z):  # type: ignore[no-untyped-def
 
 
 @kernel
-def _march_depths(start, stop, sigma, skips, target, units, result):  # type: ignore[no-untyped-def]
+def _march_depths(start, stop, sigma, skips, table, shift, cells, origins, target, units, result):  # type: ignore[no-untyped-def]
     """Write the optical depth from each voxel of slices start:stop to a point, or along a direction to the border.
 
+    Slices are numbered through all blocks.
+
     Args:
-        sigma: (X, Y, Z) float32 extinction of a medium.
-        skips: :attr:`Medium.skips` of this medium.
+        sigma: (B, x, y, z) float32 extinction of a medium.
+        skips: its :attr:`~neuprim.tasks.dynamic.volume.medium.Medium.skips`.
+        table, shift, cells, origins: attributes of its ``bricks``.
         target: (4,) float64, homogeneous: a position in indices and 1, or a direction in indices per scene unit and 0.
         units: (3, 3) float64, scene units per index.
-        result: (X, Y, Z) float32, written where sigma > 0; a ray stops at a depth of 16.
+        result: (B, x, y, z) float32, without shared voxels; written where sigma > 0. A ray stops at a depth of 16.
     """
-    nx, ny, nz = skips.shape
-    for a in range(start, stop):
-        for b in range(ny + 1):
-            for c in range(nz + 1):
-                if sigma[a, b, c] <= 0.0:
+    nx, ny, nz = cells[0], cells[1], cells[2]
+    mask = (1 << shift) - 1
+    for number in range(start, stop):
+        own, a = divmod(number, result.shape[1])
+        for b in range(result.shape[2]):
+            for c in range(result.shape[3]):
+                if sigma[own, a, b, c] <= 0.0:
                     continue
-                ox, oy, oz = float(a), float(b), float(c)
+                i, j, k = origins[own, 0] + a, origins[own, 1] + b, origins[own, 2] + c
+                ox, oy, oz = float(i), float(j), float(k)
                 rx, ry, rz = target[0] - target[3] * ox, target[1] - target[3] * oy, target[2] - target[3] * oz
                 end = _FAR
                 if target[3] > 0.0:
@@ -462,10 +395,12 @@ def _march_depths(start, stop, sigma, skips, target, units, result):  # type: ig
                     length = max(end, 1.0 / _FAR)
                     rx, ry, rz = rx / length, ry / length, rz / length
                 ix, iy, iz = _inverse_march_direction(rx), _inverse_march_direction(ry), _inverse_march_direction(rz)
-                i, j, k = min(a, nx - 1), min(b, ny - 1), min(c, nz - 1)
+                i, j, k = min(i, nx - 1), min(j, ny - 1), min(k, nz - 1)
                 t, depth = 0.0, 0.0
                 while 0 <= i < nx and 0 <= j < ny and 0 <= k < nz and t < end and depth < _DARK:
-                    skip = int(skips[i, j, k])
+                    brick = find_brick(table, shift, i, j, k)
+                    ci, cj, ck = i & mask, j & mask, k & mask
+                    skip = int(skips[brick, ci, cj, ck]) if brick >= 0 else -brick
                     reach = max(skip - 1, 0)
                     tx = _march_cell_exit(ox, ix, i, reach)
                     ty = _march_cell_exit(oy, iy, j, reach)
@@ -476,9 +411,9 @@ def _march_depths(start, stop, sigma, skips, target, units, result):  # type: ig
                             s = t + (out - t) * (_GAUSS if point == 0 else 1.0 - _GAUSS)
                             x, y = np.float32(ox + s * rx - i), np.float32(oy + s * ry - j)
                             z = np.float32(oz + s * rz - k)
-                            depth += 0.5 * (out - t) * _trilinear_march_sample(sigma, i, j, k, x, y, z)
+                            depth += 0.5 * (out - t) * _trilinear_march_sample(sigma[brick], ci, cj, ck, x, y, z)
                     i = _next_march_cell(ox, rx, i, reach, out, tx == out)
                     j = _next_march_cell(oy, ry, j, reach, out, ty == out)
                     k = _next_march_cell(oz, rz, k, reach, out, tz == out)
                     t = max(t, out)
-                result[a, b, c] = depth
+                result[own, a, b, c] = depth

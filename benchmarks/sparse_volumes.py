@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 from shared.arguments import make_parser
-from shared.tables import RESULTS, Record, Table, publish
+from shared.tables import RESULTS, Record, Table, publish, read_record
 
 from neuprim.core.compute.threads import cpu_name
 from neuprim.core.io.vdb import VdbGrid, VdbTiles, vdb_scale_transform, write_vdb
@@ -114,12 +114,20 @@ def measure_sequence(name: str, frames: int, steps: int) -> Record:
 
 
 def measure(args: argparse.Namespace) -> Record:
-    return {"cpu": cpu_name(), "rows": [measure_sequence(name, args.frames, args.steps) for name in args.scenes]}
+    rows = {row["scene"]: row for row in read_record(RECORD).get("rows", [])}
+    rows |= {name: measure_sequence(name, args.frames, args.steps) for name in args.scenes}
+    return {"cpu": cpu_name(), "rows": list(rows.values())}
 
 
 def document(record: Record) -> str:
     table = Table(
-        "sequence (generated)", "active voxels", "one file", "peak memory", "steps", "inside the mask", "correlation"
+        "sequence (generated)",
+        "active voxels",
+        "one file",
+        "peak memory",
+        "steps",
+        "inside the mask",
+        "correlation of σ",
     )
     for row in record["rows"]:
         table.row(

@@ -200,7 +200,7 @@ def import_run_directory(path: Path, out: Path, name: str | None = None) -> Path
         reader = EXPORTERS.load(name)
     except UnknownPlugin:
         raise ConfigError(
-            f"{path}: cannot import .{name} files; expected a file of `neuprim compress`, or of --format ply or npz"
+            f"{path}: cannot import .{name} files; expected a file of `neuprim compress` or `neuprim export` (ply, npz)"
         ) from None
     if reader.read is None:
         raise ConfigError(

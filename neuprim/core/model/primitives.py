@@ -51,7 +51,10 @@ class LoweredPrimitives:
     fields: tuple[str, str] | None = None  # class names of the fields, for messages
 
     def check(self, viewmat: Any = None, background: Any = None) -> None:
-        """Raise FormError if a tensor, ``viewmat`` (4, 4) or ``background`` (C,) has a wrong type, shape or device."""
+        """Raise FormError for tensors of wrong type, shape or device.
+
+        Also check ``viewmat`` (4, 4) and ``background`` (C,).
+        """
         density, colour = self.fields or (None, None)
         sizes = check_geometry(self.geometry, "geometry")
         check_lowered_density(self.density, sizes, density)

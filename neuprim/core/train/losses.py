@@ -143,7 +143,7 @@ class PointLossResult:
         parts: named parts of the loss, for the log, one number each.
         samples: the points and their true values.
         rows: indices of the primitives that are active in the frame; None for all.
-        shares: contributions of these primitives, from :func:`~neuprim.core.volumes.points.volume_values_at`.
+        shares: these primitives' contributions to extinction and error.
     """
 
     loss: Tensor

@@ -3,6 +3,7 @@ caches."""
 
 from __future__ import annotations
 
+import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -18,9 +19,9 @@ from neuprim.core.io.vdb import VdbGrid, vdb_scale_transform, write_vdb
 from neuprim.core.volumes.density_grid import box_lattice
 from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.volume import capture as capturing
-from neuprim.tasks.dynamic.volume import lit_medium
+from neuprim.tasks.dynamic.volume import capture_density, lit_medium
 from neuprim.tasks.dynamic.volume.capture_dataset import VdbFrameViews
-from neuprim.tasks.dynamic.volume.capture_density import sample_extinction
+from neuprim.tasks.dynamic.volume.capture_density import CaptureDensity, sample_extinction
 from neuprim.tasks.dynamic.volume.capture_voxels import FrameVoxels, MediumVoxels
 from neuprim.tasks.dynamic.volume.lit_medium import build_medium
 from neuprim.tasks.dynamic.volume.optics import optics_preset, override_optics
@@ -139,6 +140,16 @@ def test_the_files_extinction_on_a_lattice(data: Dataset) -> None:
     assert np.linalg.norm(world - (np.array(ORIGIN) + VOXEL * np.array([8, *MIDDLE]))) < VOXEL
     assert sampled.max() == pytest.approx(float(medium.values[..., 0].max()), rel=0.15)
     assert not sample_extinction(capture.medium(capture.frames[0]), matrix, shape).any()
+
+
+def test_of_large_boxes_some_points_are_compared(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    truth = CaptureDensity(recorded(data).capture)
+    whole = truth.points(1)
+    assert whole is not None
+    monkeypatch.setattr(capture_density, "_MOST_POINTS", math.prod(whole[1]) // 20)
+    some = truth.points(1)
+    assert some is not None and some[1] == tuple(-(-n // 3) for n in whole[1])
+    assert np.allclose(truth.grid(1, *some), truth.grid(1, *whole)[::3, ::3, ::3], atol=1e-4)
 
 
 # ---------------------------------------------------------------- time and starting points

@@ -132,7 +132,7 @@ def _unzip_vdb_chunk(chunk: bytes, size: int) -> bytes:
         raise ValueError(f"a damaged zip chunk ({error})") from None
     if len(values) != size:
         found = f"more than {size}" if len(values) > size else f"{len(values)}"
-        raise ValueError(f"a zip chunk of {found} bytes; expected {size}")
+        raise ValueError(f"an unzipped chunk of {found} bytes; expected {size}")
     return values
 
 

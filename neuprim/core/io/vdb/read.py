@@ -386,7 +386,7 @@ def list_vdb_files(path: Path) -> VdbSequence:
         DataError: no file, a name without a number, several sequences, or one number twice.
     """
     folder, chosen = Path(path), None
-    expected = "expected a folder with .vdb files, one of its files, or a name such as fire.####.vdb"
+    expected = "expected a folder with .vdb files, a numbered file like fire_12.vdb, or a name like fire.####.vdb"
     try:
         if not folder.is_dir():
             chosen = _split_frame_number(_FRAME_PATTERN.sub("0", folder.name, count=1))

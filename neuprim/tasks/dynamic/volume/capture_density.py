@@ -77,6 +77,7 @@ class CaptureDensity(DensityGridSource):
     def medium(self, frame: int) -> Medium:
         """Return the medium of a frame. The last medium is cached, since grids are requested in parts."""
         if self._cached is None or self._cached[0] != frame:
+            self._cached = None  # only one medium is in memory
             self._cached = (frame, self.capture.medium(self._files[frame]))
         return self._cached[1]
 

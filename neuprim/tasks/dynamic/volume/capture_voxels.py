@@ -264,7 +264,9 @@ class FrameVoxels(PointSupervision):
         not included, since the model adds it.
         """
         capture, medium = self.capture, self.capture.medium(frame)
-        return medium if capture.lights > 1 else light_medium(medium, capture.frame_lights(frame)[0], capture.optics)
+        if capture.lights > 1:
+            return medium
+        return light_medium(medium, capture.frame_lights(frame)[0], capture.optics, reuse=True)
 
     def _read_or_make_voxels(self, frame: VdbFrame) -> MediumVoxels:
         lit = self.capture.lights > 1

@@ -292,25 +292,28 @@ def draw_lights(optics: Optics, count: int, *key: int) -> list[Light | None]:
     return lights
 
 
-def light_medium(medium: Medium, light: Light | None, optics: Optics) -> Medium:
+def light_medium(medium: Medium, light: Light | None, optics: Optics, reuse: bool = False) -> Medium:
     """Return the medium with scattered light of ``light``, with shadows, added to its radiance.
 
-    The added radiance is the mean over all view directions: it does not depend on ``optics.anisotropy``.
+    The added radiance is the mean over all view directions: it does not depend on ``optics.anisotropy``. With
+    ``reuse``, the result overwrites the values of ``medium``, which saves memory.
     """
     if light is None or medium.empty or medium.scattered is None:
         return medium
     found = scattered_light(light_transmittance(medium, light.direction), optics.octaves, optics.octave_share)
-    return _add_scattered(medium, found, light, medium.values)
+    return _add_scattered(medium, found, light, medium.values if reuse else medium.values.copy())
 
 
 def _add_scattered(medium: Medium, scattered: np.ndarray, light: Light, values: np.ndarray) -> Medium:
-    """Return a medium with ``values`` plus the light that ``medium`` scatters, (B, x, y, z) per unit of irradiance."""
+    """Add to ``values``, in place, the light that ``medium`` scatters, (B, x, y, z) per unit of irradiance.
+
+    Return the medium with these values.
+    """
     assert medium.scattered is not None
     arriving = np.array(light.irradiance, np.float32) / np.float32(4.0 * math.pi)
-    found = values.copy()
     for c in range(3):
-        found[..., 1 + c] += medium.scattered[..., c] * (scattered * arriving[c])
-    return replace(medium, values=found, scattered=None).require_finite()
+        values[..., 1 + c] += medium.scattered[..., c] * (scattered * arriving[c])
+    return replace(medium, values=values, scattered=None).require_finite()
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,7 +338,7 @@ class LitMedium:
             return LitMedium(light_medium(medium, light, optics))
         dark = medium.values * np.array([1, 0, 0, 0], np.float32)
         found = octaves_of_light(light_transmittance(medium, light.direction), optics.octaves, optics.octave_share)
-        beams = ((_add_scattered(medium, t, light, dark), optics.anisotropy / 2**o) for o, t in enumerate(found))
+        beams = ((_add_scattered(medium, t, light, dark.copy()), optics.anisotropy / 2**o) for o, t in enumerate(found))
         return LitMedium(medium, tuple(beams), light.direction)
 
     @property

@@ -365,7 +365,7 @@ def _read_stl_text(path: Path, data: bytes) -> tuple[list[Faces], int]:
     try:
         corners = np.array(words, dtype=np.float64).reshape(-1, 3, 3)
     except ValueError as error:
-        raise DataError(f"{path}: cannot be read as STL ({error}); expected a complete file") from None
+        raise DataError(f"{path}: bad number or incomplete face ({error}); expected valid STL text") from None
     check_vertices(path, corners.reshape(-1, 3), np.arange(len(words)))
     return [Faces(corners)] if len(corners) else [], len(words)
 

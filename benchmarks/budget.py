@@ -113,11 +113,11 @@ def describe_falls(runs: Sequence[Run]) -> str:
         for few, many, gain in gains(runs, scene, measure)
     ]
     found = [text for text, gain in doublings if gain < -FALL]
-    head = f"Of {len(doublings)} doublings (every measure by itself)"
+    head = f"Doubling the budget lowered a PSNR by more than {FALL} dB in"
     if not found:
-        return f"{head} none made anything worse by more than {FALL} dB."
+        return f"{head} none of {len(doublings)} cases."
     listed = "\n".join(f"* {line}" for line in found)
-    return f"{head} {len(found)} made something worse by more than {FALL} dB:\n\n{listed}"
+    return f"{head} {len(found)} of {len(doublings)} cases:\n\n{listed}"
 
 
 def make_chart(scene: str, runs: Sequence[Run]) -> Chart:

@@ -102,10 +102,10 @@ class Command:
 
 
 def add_trust_flag(parser: argparse.ArgumentParser) -> None:
-    """Add the flag ``--trust``. It allows a stored configuration to name network addresses, and folders outside its run
-    directory to write to (:mod:`neuprim.config.stored_run`).
+    """Add the flag ``--trust``. It lets a stored configuration make neuprim contact network addresses and write outside
+    the run directory (:mod:`neuprim.config.stored_run`).
     """
-    text = "allow what a stored config.yaml names: network addresses, and folders outside of the run to write to"
+    text = "let a stored config.yaml make neuprim contact network addresses and write outside the run directory"
     parser.add_argument(FLAG, action="store_true", help=text)
 
 

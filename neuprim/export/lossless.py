@@ -91,7 +91,7 @@ def _read_npz_export(path: Path) -> StoredModel:
                 raise DataError(f"{path}: no array 'header'; expected a file written by `neuprim export --format npz`")
             text = _read_npz_export_array(archive, entries["header.npy"], path, _HEADER_BYTES)
             if text.dtype.kind != "U" or text.shape != ():
-                raise DataError(f"{path}: header is {text.dtype} of shape {text.shape}; expected a single text")
+                raise DataError(f"{path}: array 'header' is not one string; expected a neuprim export")
             header, shapes, config = _unpack_export_header(str(text), path)
             tensors = {}
             for name, shape in shapes.items():

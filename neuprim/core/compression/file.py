@@ -280,7 +280,7 @@ def _checked_codec_section(name: str, coding: int, shape: tuple[int, ...]) -> Co
         {TEXT: (), POSITIONS: (3,), ROTATIONS: (4,)}.get(coding, shape),
     )
     if shape != wanted:
-        raise CorruptSection(f"section {name!r} of {CODINGS[coding]} has shape {shape}; expected {wanted}")
+        raise CorruptSection(f"section {name!r} is damaged: shape {shape}; coding {CODINGS[coding]} expects {wanted}")
     if (coding == TEXT) != (name == CONFIG):
         raise CorruptSection(
             f"section {name!r} has coding {CODINGS[coding]}; expected coding text in section {CONFIG!r} and in no other"

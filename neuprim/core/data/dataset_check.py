@@ -133,7 +133,7 @@ def _check_dataset_view(view: View, where: str, conditions: Sequence[ConditionSp
     _check_dataset_instance(where, view, View)
     where = f"{where} ({view.name})" if view.name else where
     if not isinstance(view.name, str) or not view.name:
-        raise DatasetError(f"{where}: name is {view.name!r}; expected text")
+        raise DatasetError(f"{where}: name is {view.name!r}; expected nonempty text")
     _check_dataset_camera(view.camera, where)
     for spec in conditions:
         what = f"{where}: condition {spec.name!r}"

@@ -303,8 +303,8 @@ class ViewCorrections(_NumbersOfViews):
 def _looked_at(rotations: Tensor, shifts: Tensor) -> Tensor:
     """Return the (3,) point nearest to the optical axes of V cameras, which minimises the sum of squared distances.
 
-    World-to-camera matrices have the rotations (V, 3, 3) and shifts (V, 3). If all axes are parallel within about 3
-    degrees, they do not determine the position along them. Then it is that of the mean camera centre, because a
+    World-to-camera matrices have the rotations (V, 3, 3) and shifts (V, 3). Axes that are parallel within about 3
+    degrees do not determine the point's depth. The point then has the depth of the mean camera centre, because a
     rotation around a far point would move the cameras far.
     """
     sideways = rotations[:, :2].flatten(0, 1)  # (2 V, 3): a point on an axis has the camera coordinates (0, 0, z)

@@ -283,7 +283,7 @@ DAMAGE: dict[str, tuple[Callable[[], bytes], tuple[str, ...]]] = {
         ("1048577 bytes; expected at most 1048576",)),
     "shape": (lambda: by_hand(sections={"W1": (1, (2**32 - 1, 0), b"", b"")}), ("expected at most 1048576 numbers",)),
     "positions' shape": (lambda: by_hand(sections={"means": (2, (4,), RECORD * 4, b"ab")}),
-        ("of positions has shape (4,)",)),
+        ("shape (4,); coding positions expects (3,)",)),
     "positions' bits": (
         lambda: by_hand(sections={"means": (2, (3,), RECORD * 2 + struct.pack("<Bff", 9, 0.0, 1.0), bytes(6))}),
         ("three columns with the same number of bits",),

@@ -89,7 +89,7 @@ FAULTS: dict[str, Callable[[Any], None]] = {
     f"{VIEW}camera: camera rotation is singular or scaled": viewed("train", camera=SCALED),
     f"{VIEW}camera is Camera(": viewed("train", camera=TEXTS),
     f"{VIEW}camera: viewmat is a numpy.ndarray": viewed("train", camera=NUMPY),
-    "train view 0: name is ''; expected text": viewed("train", name=""),
+    "train view 0: name is ''; expected nonempty text": viewed("train", name=""),
     "test view 0 is a str; expected a neuprim.core.data.dataset.View": wrong_view,
     "two: start is None; expected a function of (views, count, generator)": member(start=None),
     "two: exposure is 0; expected a positive number": member(exposure=0),

@@ -146,7 +146,7 @@ def test_refusals(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     )
     write_vdb(tmp_path / "far.vdb", [far])
     (far,) = read_grids(tmp_path / "far.vdb")
-    with pytest.raises(DataError, match=r"100009 x 100009 x 100009 voxels; expected at most 134217728 bricks"):
+    with pytest.raises(DataError, match=r"100009 x 100009 x 100009 voxels; expected at most 33554432 bricks"):
         build_medium({"density": far}, LOOK, np.eye(4))
     monkeypatch.setattr(lit_medium, "_DENSE_VOXELS", 0)
     monkeypatch.setattr(lit_medium, "DENSE_LIMIT", 9**3 * 16 * 20)

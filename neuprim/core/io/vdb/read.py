@@ -139,8 +139,8 @@ class _TreeReader:
         for first in range(0, count, _CHUNK):
             self._leaves(first, min(first + _CHUNK, count))
         if self._buffers.at != self._buffers.end:
-            found = f"leaf buffers end at byte {self._buffers.at}"
-            raise cursor.fail(f"{what}: {found}; the header says {self._buffers.end}")
+            found = f"leaf buffers end at byte {self._buffers.at}, not {self._buffers.end}"
+            raise cursor.fail(f"{what}: {found}; damaged OpenVDB file")
         self.values = self.values.reshape(count, 8, 8, 8, *self._shape)
         self.masks = self.masks.reshape(count, 8, 8, 8)
 
@@ -162,7 +162,7 @@ class _TreeReader:
             self._root_entry(seen, origin)
             self._upper(np.array(origin, np.int32))
         if cursor.at != cursor.end:
-            raise cursor.fail(f"{what}: nodes end at byte {cursor.at}; the header says {cursor.end}")
+            raise cursor.fail(f"{what}: nodes end at byte {cursor.at}, not {cursor.end}; damaged OpenVDB file")
 
     def _root_entry(self, seen: set[tuple[int, ...]], origin: tuple[int, ...]) -> None:
         if origin in seen or any(v % TILE_SIZES[2] for v in origin):

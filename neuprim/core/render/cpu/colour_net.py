@@ -192,7 +192,7 @@ def _unit_waves(S, V0, n, p, o):  # type: ignore[no-untyped-def]
 
 @inline
 def _unit_waves_float64(D, V0, n, p, o):  # type: ignore[no-untyped-def]
-    """Like :func:`_unit_waves`, from a network's float64 row ``p`` and the float64 chord middles in ``D``."""
+    """Like :func:`_unit_waves`, but compute the phases in float64, from chords ``D`` and network row ``p``."""
     for k in range(n):
         r = chord_phase_float64(D, k, p, o)
         z = r * r

@@ -92,7 +92,7 @@ class Projected(NamedTuple):
 
     @classmethod
     def allocate(cls, count: int, neurons: int) -> Projected:
-        """Allocate memory for ``count`` primitives with ``neurons`` neurons each, padded to an even number."""
+        """Allocate arrays for ``count`` primitives; ``rows`` and ``kinds`` pad ``neurons`` to an even number."""
         padded = neurons + neurons % 2
         return cls(
             rows=np.empty((count, L.row_width(padded)), np.float32),

@@ -132,7 +132,7 @@ EDGE = 8
 """Cells of a brick along each axis; a leaf of a .vdb file has as many voxels."""
 
 _SHIFT, _WHOLE = 3, 31  # binary logarithms of the edges of a brick, and of the block of a dense layout
-_MOST_BRICKS = 2**27  # of a box, empty ones included: 512 MB
+_MOST_BRICKS = 2**25  # of a box, empty ones included: 128 MB
 _POINTS_PER_JOB = 1 << 14
 
 

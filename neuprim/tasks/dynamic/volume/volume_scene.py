@@ -403,8 +403,8 @@ def join_time_chunks(models: Sequence[Primitives], numbers: Sequence[int], overl
     for model in models:
         if not isinstance(model.density, TimeDensity) or model.density.seams:
             raise ConfigError(
-                f"cannot join chunks: the density of a chunk is {type(model.density).__name__} "
-                f"{model.density.settings()}; expected a TimeDensity without seams (not joined yet)"
+                f"cannot join chunks: the density of one is {type(model.density).__name__} "
+                f"{model.density.settings()}; expected a TimeDensity without seams (overlaps of joined chunks)"
             )
         if any(getattr(model, kind).settings() != getattr(first, kind).settings() for kind in ("density", "colour")):
             raise ConfigError(

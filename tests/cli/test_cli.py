@@ -1,3 +1,4 @@
+import importlib
 import json
 import shlex
 import shutil
@@ -25,6 +26,11 @@ from tests.plugins.fakes import site, toy
 
 __all__ = ["site", "toy"]
 
+
+MODULES_WITH_LOAD_RUN = [
+    *(f"neuprim.runs.{name}" for name in ("export", "measure", "render_images")),
+    *(f"neuprim.search.{name}" for name in ("compress", "pruning", "tradeoff_measuring")),
+]
 
 METRICS: dict[str, Any] = {
     "task": "toy",
@@ -65,8 +71,9 @@ def calls(toy: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         made.append((getattr(run, "directory", run), request))
         return [Path("a.png"), Path("b.png")]
 
+    for module in MODULES_WITH_LOAD_RUN:  # a first import inside the test would keep the replacement
+        importlib.import_module(module)
     monkeypatch.setattr("neuprim.runs.open.load_run", load_run)
-
     monkeypatch.setattr("neuprim.runs.run.run", run)
     monkeypatch.setattr("neuprim.runs.measure.evaluate_run", evaluate_run)
     monkeypatch.setattr("neuprim.runs.render_images.render_run", render_run)

@@ -5,8 +5,8 @@
 makes two sequences of .vdb files (half floats, Blosc), trains the preset quick on each in a process of its own, and
 measures the peak memory of that process. Both are generated here:
 
-    trail   1.1 million active voxels along the diagonal of a box of 2026 x 1526 x 1172 voxels; one file is about 4 MB
-    plume   21.5 million active voxels (2 %) of 1024 x 1024 x 1024: a winding tube
+    trail   1.1 million active voxels along the diagonal of a box of 2026 x 1526 x 1172 voxels; one file has 2.5 MB
+    plume   21 million active voxels (2 %) of 1024 x 1024 x 1024: a winding tube
 
 The errors of the extinction are those of metrics.json: on every third voxel along each axis of the trail, and on every
 second of the plume. --record writes benchmarks/results/sparse_volumes.json and the table of docs/results/dynamic.md.

@@ -111,7 +111,7 @@ def test_light_and_voxels_are_the_same(seed: int, monkeypatch: pytest.MonkeyPatc
 
 
 def test_tiles_are_filled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A constant tile of 128 voxels, which reaches out of the box on one side, beside a leaf far away."""
+    """A constant tile of 128 voxels, which reaches out of the box on one side, and a leaf far away."""
     leaf = VdbGrid.from_dense(
         "density", np.full((3, 2, 1), 0.5), lower=(300, 200, 7), transform=np.diag([1 / 300] * 3 + [1])
     )
@@ -127,6 +127,18 @@ def test_tiles_are_filled(monkeypatch: pytest.MonkeyPatch) -> None:
     a, b = render_medium(dense, view), render_medium(sparse, view)
     assert float(a[..., 3].max()) > 0.01 and torch.allclose(a, b, rtol=1e-4, atol=1e-6)
     assert np.array_equal(MediumVoxels.of(dense).values, MediumVoxels.of(sparse).values)
+
+
+@pytest.mark.parametrize("flame", [1.0, 0.0])
+def test_flames_in_one_leaf_on_other_voxels(flame: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The flames have a single brick, or no active voxel."""
+    grids = fire(0)
+    place = grids["flames"].transform.copy()
+    place[:3, 3] += place[:3, :3] @ [9.0, 9.0, 9.0]
+    grids["flames"] = VdbGrid.from_dense("flames", np.full((4, 3, 2), flame), lower=(2, 3, 1), transform=place)
+    dense, sparse = both(grids, LOOK, monkeypatch)
+    a, b = (MediumVoxels.of(medium, lit=True) for medium in (dense, sparse))
+    assert np.allclose(a.values, b.values, rtol=1e-4, atol=1e-5)
 
 
 def test_a_grid_with_another_background_stays_dense(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -206,19 +206,23 @@ class _MediumGrid:
         return sampled[0] if grid.channels == 1 else np.stack(sampled, -1)
 
     def _sample_bricks(self, grid: VdbGrid) -> np.ndarray:
-        same = _same_voxels(grid.transform, self.transform)
-        own = self if same or grid.bounds is None else _MediumGrid.in_bricks([grid], grid.transform, grid.bounds)
+        own = self
+        if not _same_voxels(grid.transform, self.transform):
+            if grid.bounds is None:
+                return np.zeros((len(self.bricks.origins), *self.bricks.block, *grid.values.shape[4:]), np.float32)
+            own = _MediumGrid.in_bricks([grid], grid.transform, grid.bounds)
         values = read_bricks(grid, own.first, own.bricks)
         values[~np.isfinite(values)] = 0.0
         if own is self:
             return values
+        found = np.zeros((len(self.bricks.origins), *self.bricks.block, *grid.values.shape[4:]), np.float32)
         matrix = np.linalg.inv(grid.transform) @ self.transform
-        found = np.zeros((len(self.bricks.origins), *self.bricks.block, *values.shape[4:]), np.float32)
-        for brick, origin in enumerate(self.bricks.origins):
-            index = (np.indices(self.bricks.block).reshape(3, -1).T + origin + self.first) @ matrix[:3, :3].T
-            points = index + matrix[:3, 3] - own.first
+        inside = np.indices(self.bricks.block).reshape(3, -1).T @ matrix[:3, :3].T
+        origins = (self.bricks.origins + self.first) @ matrix[:3, :3].T + matrix[:3, 3] - own.first
+        for brick, origin in enumerate(origins):
             for c in np.ndindex(values.shape[4:]):
-                found[(brick, ..., *c)] = own.bricks.sample(values[(..., *c)], points).reshape(self.bricks.block)
+                sampled = own.bricks.sample(values[(..., *c)], inside + origin)
+                found[(brick, ..., *c)] = sampled.reshape(self.bricks.block)
         return found
 
 

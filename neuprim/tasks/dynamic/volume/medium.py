@@ -144,17 +144,17 @@ class Bricks:
         shape: voxels of the box along each axis.
         table: int32, one entry per brick of the box: its number, or -d for an empty brick. Every cell within a
             chessboard distance below d of any cell of this brick is empty.
-        block: voxels (x, y, z) of a block.
+        dense: whether one block has all voxels of the box.
     """
 
     shape: tuple[int, int, int]
     table: np.ndarray
-    block: tuple[int, int, int] = (EDGE + 1,) * 3
+    dense: bool = False
 
     @staticmethod
     def whole(shape: tuple[int, int, int]) -> Bricks:
         """Return the dense layout: one block with all voxels of the box."""
-        return Bricks(shape, np.zeros((1, 1, 1), np.int32), shape)
+        return Bricks(shape, np.zeros((1, 1, 1), np.int32), dense=True)
 
     @staticmethod
     def at(used: np.ndarray) -> Bricks:
@@ -170,9 +170,9 @@ class Bricks:
         return Bricks((x, y, z), table)
 
     @property
-    def dense(self) -> bool:
-        """Whether one block has all voxels of the box."""
-        return self.block == self.shape
+    def block(self) -> tuple[int, int, int]:
+        """Voxels (x, y, z) of a block."""
+        return self.shape if self.dense else (EDGE + 1,) * 3
 
     @property
     def shift(self) -> int:
@@ -294,6 +294,18 @@ def find_brick(table, shift, i, j, k):  # type: ignore[no-untyped-def]
     return table[np.uint64(i >> shift), np.uint64(j >> shift), np.uint64(k >> shift)]
 
 
+@inline
+def trilinear_sample(v, i, j, k, x, y, z):  # type: ignore[no-untyped-def]
+    """Return the trilinear value of a block ``v`` (x, y, z) in its cell (i, j, k), at the fractions x, y, z of it."""
+    a = v[i, j, k] + z * (v[i, j, k + 1] - v[i, j, k])
+    b = v[i, j + 1, k] + z * (v[i, j + 1, k + 1] - v[i, j + 1, k])
+    c = v[i + 1, j, k] + z * (v[i + 1, j, k + 1] - v[i + 1, j, k])
+    d = v[i + 1, j + 1, k] + z * (v[i + 1, j + 1, k + 1] - v[i + 1, j + 1, k])
+    a += y * (b - a)
+    c += y * (d - c)
+    return a + x * (c - a)
+
+
 @kernel
 def _sample_points(start, stop, values, table, shift, cells, points, found):  # type: ignore[no-untyped-def]
     """Write the trilinear values at ``points[start:stop]`` to ``found``; see :meth:`Bricks.sample`."""
@@ -307,10 +319,4 @@ def _sample_points(start, stop, values, table, shift, cells, points, found):  # 
         if brick < 0:
             continue
         x, y, z = x - i, y - j, z - k
-        i, j, k = i & mask, j & mask, k & mask
-        total = 0.0
-        for corner in range(8):
-            a, b, c = corner >> 2, corner >> 1 & 1, corner & 1
-            share = (x if a else 1 - x) * (y if b else 1 - y) * (z if c else 1 - z)
-            total += share * values[brick, i + a, j + b, k + c]
-        found[n] = total
+        found[n] = trilinear_sample(values[brick], i & mask, j & mask, k & mask, x, y, z)

@@ -23,7 +23,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.compute.kernels import inline, kernel
 from neuprim.core.compute.threads import parallel_for
-from neuprim.tasks.dynamic.volume.medium import Medium, find_brick
+from neuprim.tasks.dynamic.volume.medium import Medium, find_brick, trilinear_sample
 
 _ROWS_PER_JOB, _SLICES_PER_JOB = 4, 2
 _GAUSS, _FAR = 0.5 - math.sqrt(3.0) / 6.0, 1e30
@@ -349,18 +349,6 @@ def _march_image_rows(  # type: ignore[no-untyped-def]
             image[row, column, 3] = sum_a * weight
 
 
-@inline
-def _trilinear_march_sample(v, i, j, k, x, y, z):  # type: ignore[no-untyped-def]
-    """Return the trilinear value of a block ``v`` (x, y, z) in its cell (i, j, k), at the fractions x, y, z of it."""
-    a = v[i, j, k] + z * (v[i, j, k + 1] - v[i, j, k])
-    b = v[i, j + 1, k] + z * (v[i, j + 1, k + 1] - v[i, j + 1, k])
-    c = v[i + 1, j, k] + z * (v[i + 1, j, k + 1] - v[i + 1, j, k])
-    d = v[i + 1, j + 1, k] + z * (v[i + 1, j + 1, k + 1] - v[i + 1, j + 1, k])
-    a += y * (b - a)
-    c += y * (d - c)
-    return a + x * (c - a)
-
-
 @kernel
 def _march_depths(start, stop, sigma, skips, table, shift, cells, origins, target, units, result):  # type: ignore[no-untyped-def]
     """Write the optical depth from each voxel of slices start:stop to a point, or along a direction to the border.
@@ -411,7 +399,7 @@ def _march_depths(start, stop, sigma, skips, table, shift, cells, origins, targe
                             s = t + (out - t) * (_GAUSS if point == 0 else 1.0 - _GAUSS)
                             x, y = np.float32(ox + s * rx - i), np.float32(oy + s * ry - j)
                             z = np.float32(oz + s * rz - k)
-                            depth += 0.5 * (out - t) * _trilinear_march_sample(sigma[brick], ci, cj, ck, x, y, z)
+                            depth += 0.5 * (out - t) * trilinear_sample(sigma[brick], ci, cj, ck, x, y, z)
                     i = _next_march_cell(ox, rx, i, reach, out, tx == out)
                     j = _next_march_cell(oy, ry, j, reach, out, ty == out)
                     k = _next_march_cell(oz, rz, k, reach, out, tz == out)

@@ -128,16 +128,17 @@ def vdb_recording_of(dataset: Dataset) -> VolumeRecording | None:
 def matter_mask(dataset: Dataset, index: int) -> Tensor | None:
     """Return (H, W) bool: pixels that smoke or fire covers in at least one frame of a test view's camera.
 
-    The result is None for datasets without a volume sequence.
+    The result is None for datasets without a volume sequence, and if training views are held out instead of the
+    sequence's own test cameras.
     """
     recording = vdb_recording_of(dataset)
-    return None if recording is None else recording.matter_mask(index)
+    return None if recording is None or dataset.test is not recording.test else recording.matter_mask(index)
 
 
 def held_out_clips(dataset: Dataset) -> Sequence[Clip]:
-    """Return one video clip of all frames per test camera; no clips if the dataset has no volume sequence."""
+    """Return one video clip of all frames per test camera; no clips where :func:`matter_mask` has no masks."""
     recording = vdb_recording_of(dataset)
-    if recording is None:
+    if recording is None or dataset.test is not recording.test:
         return ()
     n = len(recording.capture.frames)
     return [Clip(f"cam_{c:02d}", range(i * n, (i + 1) * n), 24.0) for i, c in enumerate(recording.test.cameras)]

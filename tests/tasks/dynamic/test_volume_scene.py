@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from neuprim.core.data import Dataset
+from neuprim.core.data.dataset import hold_out_views
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import VdbGrid, vdb_scale_transform, write_vdb
 from neuprim.core.volumes.density_grid import box_lattice
@@ -84,6 +85,12 @@ def test_frames_in_numerical_order_cameras_and_times(data: Dataset) -> None:
         {tuple(v.view(i).camera.position.tolist()) for i in range(len(v))} for v in (data.train, data.test)
     )
     assert len(trained) == 4 and len(held_out) == 2 and not trained & held_out
+
+
+def test_held_out_training_views_have_neither_masks_nor_clips_of_test_cameras(data: Dataset) -> None:
+    held = hold_out_views(data, 2)
+    assert TASK.mask is not None and TASK.mask(data, 0) is not None and TASK.mask(held, 0) is None
+    assert len(TASK.clips(data)) == 2 and not TASK.clips(held)
 
 
 def test_images_are_radiance_over_the_exposures_peak_with_alpha(data: Dataset) -> None:

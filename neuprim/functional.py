@@ -30,8 +30,9 @@ class Rasterized:
     Attributes:
         rgb: (C, H, W, channels) colours, composited over the backgrounds.
         alpha: (C, H, W) accumulated opacity: 1 minus the transmittance behind all primitives.
-        depth: (C, H, W) mean depth (camera z, scene units), weighted like the colours; a primitive's depth is that of
-            the middle of the ray's segment inside it. 0 where a ray hits no primitive. None unless ``depth=True``.
+        depth: (C, H, W) mean depth (camera z, scene units), weighted like the colours. The depth of a primitive is
+            the depth of the middle of the ray's segment inside the primitive. 0 where a ray hits no primitive. None
+            unless ``depth=True``.
         stats: statistics of each camera's image, see :class:`~neuprim.core.render.output.RenderStats`.
     """
 
@@ -74,14 +75,16 @@ def rasterize(
         sigma(x) = g (1 - |y|^2)^p f((x - mu) / m) / m,   m = max(s),   y = diag(1 / s) R^T (x - mu),
         g = exp(log_gain),   f(u) = sum_k w2_k cos(omega0 (W1_k . u + b1_k)) + b2
 
-    and 0 outside. With I the integral of sigma along a pixel's ray, in closed form, and primitives sorted front to
-    back,
+    and 0 outside. The exponent p is ``edge``; W1, b1, w2, b2 and log_gain are tensors of ``primitives``. I_i is the
+    integral, in closed form, of the density of primitive i along a pixel's ray. Primitives are sorted front to back:
 
         alpha_i = min(alpha_max, 1 - exp(-max(I_i, 0))),   T_i = prod_{j<i} (1 - alpha_j),
         rgb = sum_i colors_i alpha_i T_i + T background.
 
-    Gradients reach every primitive tensor, ``viewmats`` (all twelve entries) and ``backgrounds`` on every backend, and
-    ``Ks`` with ``backend="reference"``.
+    T is the product of all 1 - alpha_j, and alpha_max is a render setting.
+
+    Gradients reach every primitive tensor, ``viewmats`` (all twelve entries) and ``backgrounds`` on every backend.
+    Gradients reach ``Ks`` only with ``backend="reference"``.
 
     Args:
         primitives: name -> tensor. All tensors and the images have the same device and dtype, float32 or float64:
@@ -89,8 +92,8 @@ def rasterize(
             ``quats`` (N, 4) wxyz, any non-zero norm; ``W1`` (N, K, 3) frequencies, ``b1`` (N, K) phases, both without
             the factor omega0, ``w2`` (N, K) amplitudes, ``b2`` (N, 1) or (N,) offsets, K is 0 to 256; ``colors``
             (N, channels), or (C, N, channels) for colours that depend on the camera; and optionally ``log_gain``
-            (N, 1) or (N,), clamped to +-20, without gradient beyond.
-        viewmats: (C, 4, 4) world-to-camera, OpenCV axes (x right, y down, z forward). float64 is best.
+            (N, 1) or (N,), clamped to +-20; clamped values get no gradient.
+        viewmats: (C, 4, 4) world-to-camera, OpenCV axes (x right, y down, z forward). float64 is most accurate.
         Ks: (C, 3, 3) intrinsics in pixels, ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``; pixel centres lie at +0.5.
         size: (width, height) of every image in pixels.
         omega0: factor on the phase W1_k . u + b1_k of every cosine.
@@ -103,7 +106,7 @@ def rasterize(
             The message names the argument, what was found and what was expected.
         ConfigError: a setting is unknown, or its value is impossible.
         NonFiniteError: a primitive tensor or background holds NaN or infinity, or a quaternion is zero.
-        BackendUnavailable: ``Ks`` requires a gradient, but ``backend`` allows a backend that does not compute it.
+        BackendUnavailable: ``Ks`` requires a gradient, but ``backend`` allows a backend without this gradient.
     """
     render_settings = _render_settings(settings)
     geometry, density, palettes = _check_primitives(primitives, len(viewmats), omega0, edge)
@@ -159,8 +162,8 @@ def _check_primitives(
 ) -> tuple[Geometry, Cosine, list[Tensor]]:
     """Check names, types and shapes of the tensors ``t``, the argument ``primitives`` of :func:`rasterize`.
 
-    Only ``log_gain`` is also checked for NaN and infinity. Return the ellipsoids, their density, and a tensor
-    (N, channels) of colours for each of ``views`` cameras.
+    Only ``log_gain`` is also checked for NaN and infinity. Return the ellipsoids, the density field with the gain
+    applied, and a tensor (N, channels) of colours for each of ``views`` cameras.
     """
     for name in t:
         if name not in (*_REQUIRED, "log_gain"):

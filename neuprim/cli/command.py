@@ -56,8 +56,8 @@ class Command:
         epilog: text below the arguments in ``neuprim NAME --help``, or a function that makes it from the typed words.
         settings: help text that says what ``KEY=VALUE`` sets; empty if the command has no settings. Settings may be
             anywhere on the command line, and become ``arguments.overrides``.
-        take_rest: function (arguments, rest, parser) for ``rest``, the words that argparse does not know. It stores the
-            words that the command accepts, and returns the others, which are then refused.
+        take_rest: function (arguments, rest, parser) for ``rest``, the words that argparse does not know. The function
+            stores the words that the command accepts, and returns all other words, which are then refused.
         opens_run: whether the command takes an existing run directory; if so, ``RUN_DIR`` and ``--trust`` are added.
     """
 
@@ -102,8 +102,10 @@ class Command:
 
 
 def add_trust_flag(parser: argparse.ArgumentParser) -> None:
-    """Add the flag ``--trust``. It lets a stored configuration make neuprim contact network addresses and write outside
-    the run directory (:mod:`neuprim.config.stored_run`).
+    """Add the flag ``--trust``.
+
+    With this flag, a stored configuration can make neuprim contact network addresses and write outside the run
+    directory (:mod:`neuprim.config.stored_run`).
     """
     text = "let a stored config.yaml make neuprim contact network addresses and write outside the run directory"
     parser.add_argument(FLAG, action="store_true", help=text)
@@ -191,8 +193,8 @@ def refuse_argument(word: str, parser: argparse.ArgumentParser, task: TaskSpec |
 def plain_console(stderr: bool = False, **options: Any) -> Console:
     """Return a rich console that prints text unchanged: no markup, emoji, automatic colours or line wrapping.
 
-    rich reads ``[name]`` as markup and ``:name:`` as an emoji. Without this, ``pip install 'neuprim[video]'`` would be
-    printed without its extra.
+    By default, rich reads ``[name]`` as markup and ``:name:`` as an emoji, so that ``pip install 'neuprim[video]'``
+    would be printed without ``[video]``.
     """
     from rich.console import Console
 

@@ -116,8 +116,8 @@ def _add_bench_arguments(parser: argparse.ArgumentParser) -> None:
 def _bench_command(args: argparse.Namespace) -> int:
     """Run the command ``bench paper`` and return the exit status.
 
-    Without ``--data``, print the tables of the paper. With it, train the runs of the tables and print our values next
-    to the paper's.
+    Without ``--data``, print the tables of the paper. With ``--data``, train the runs of the tables, and print our
+    values next to the paper's.
     """
     from neuprim.cli.progress import run_command_here
     from neuprim.config.command_settings import take_budget_override

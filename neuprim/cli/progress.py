@@ -135,7 +135,7 @@ class DrawProgress(_ProgressBar):
         self.console.print(f"neuprim: {text}")
 
     def show(self, text: str, fraction: float) -> None:
-        """Show ``text`` and the completed ``fraction``, 0..1. Without a terminal, print both every 30 seconds."""
+        """Show ``text`` and the completed ``fraction``, 0..1. Without a terminal, print a line every 30 seconds."""
         self.bar.update(self.task, description=text, completed=fraction)
         if not self.live and fraction < 1.0 and time.monotonic() > self._started + 30.0:
             self._started = time.monotonic()
@@ -151,7 +151,7 @@ def print_notes(event: Event) -> None:
 # ---------------------------------------------------------------- several jobs
 
 _LINE_INTERVAL = 0.25
-"""Progress of a training, as a fraction, between two printed lines; for output that is not a terminal."""
+"""Progress of one of several runs, as a fraction, between two printed lines, if the output is not a terminal."""
 
 
 class RunLaunchProgress:

@@ -92,7 +92,7 @@ def _render_command(arguments: argparse.Namespace) -> int:
     from neuprim.runs.render_images import RenderRequest, render_run
 
     if arguments.shutter is None and arguments.shutter_samples is not None:
-        raise ConfigError("--shutter-samples: found without --shutter; expected both. Pass --shutter 0.5.")
+        raise ConfigError("--shutter-samples: needs --shutter, too; pass for example --shutter 0.5")
     names = "size format out frame frames conditions fps space layers datatype shutter shutter_samples".split()
     given = {name: value for name in names if (value := getattr(arguments, name)) is not None}
     request = RenderRequest(
@@ -285,8 +285,9 @@ def _vdb_info_command(arguments: argparse.Namespace) -> int:
 
 
 def _find_vdb_command_files(path: Path) -> tuple[list[Path], list[str], bool]:
-    """Return the OpenVDB files at ``path`` (a file or folder) in the order of frames, texts that describe the folder,
-    and whether the files are one sequence.
+    """Find the OpenVDB files at ``path``, a file or folder.
+
+    Return the files in the order of frames, texts that describe the folder, and whether the files are one sequence.
     """
     if not path.is_dir():
         return [path], [], False

@@ -27,12 +27,12 @@ class LauncherSettings:
 
     Attributes:
         name: "inline" (this process, one after the other), "processes" (on this machine), "ray" or "slurm".
-        workers: runs at the same time; null: as many as there are, and as the cores of this machine or the cluster
-            allow.
+        workers: runs at the same time; null: as many as there are runs, and as the cores of this machine or the
+            cluster allow.
         threads: threads of each run; null shares the cores.
         retries: how often a run continues from its checkpoint after its worker died.
         address: address of Ray, as ``ray.init`` takes it; for Slurm the executor of submitit, "slurm" or "local". null:
-            the Ray of ``RAY_ADDRESS``, else one on this machine; Slurm.
+            for Ray the cluster at ``RAY_ADDRESS``, else this machine; for submitit "slurm".
         options: options of the engine: of a Ray task, such as ``num_gpus``, or of submitit, such as
             ``slurm_partition``.
     """
@@ -59,7 +59,7 @@ class ViewerSettings:
 
     Attributes:
         host: address of this machine to listen on; only this machine can reach the default.
-        port: port of the page; 0 for any that is free.
+        port: port of the page; 0 for any free port.
     """
 
     host: Annotated[str, nonempty_text("an address of this machine")] = LOOPBACK
@@ -73,8 +73,8 @@ class ViewerSettings:
 class SearchTarget:
     """What a model is to reach: ``target.psnr=30``.
 
-    With ``psnr`` or ``ssim``, or both, the result is the smallest model that reaches them, and ``megabytes`` and
-    ``fps`` are limits; without, it is the best model within the limits.
+    With ``psnr``, ``ssim`` or both, the result is the smallest model that reaches these values; ``megabytes`` and
+    ``fps`` are limits. Without ``psnr`` and ``ssim``, the result is the best model within the limits.
 
     Attributes:
         psnr: PSNR to reach, mean over views, dB.
@@ -139,7 +139,8 @@ def take_target_overrides(overrides: Sequence[str]) -> tuple[tuple[SearchTarget,
         raise ConfigError(f"target={format_setting_value(whole)}: expected one of {_TARGETS}")
     asked = "target" if budget is None else f"budget={budget}"
     if not target.given_settings():
-        raise ConfigError(f"{asked}: no target; expected one of {_TARGETS}; for a run without one, train.max_seconds=S")
+        other = "train.max_seconds=S for a run without a target"
+        raise ConfigError(f"{asked}: no target given; expected one of {_TARGETS}, or {other}")
     if budget is None:
         expected = "a budget, the time for search and training together, such as budget=10m"
         raise ConfigError(f"{target}: expected {expected}")

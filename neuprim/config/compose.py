@@ -1,8 +1,8 @@
 """Compose a :class:`RunConfig` from the overrides of ``neuprim run``.
 
-A setting's value comes from the first of these that has it: overrides, the level of effort, a stored run, the preset,
-the defaults of the settings dataclasses. Hydra parses the overrides. OmegaConf merges them with the YAML files and
-resolves ``${...}``. The settings dataclasses define which keys exist.
+A setting's value comes from the first of these sources that sets it: overrides, the level of effort, a stored run,
+the preset, the defaults of the settings dataclasses. Hydra parses the overrides. OmegaConf merges the overrides with
+the YAML files and resolves ``${...}``. The settings dataclasses define which keys exist.
 """
 
 from __future__ import annotations
@@ -85,10 +85,10 @@ if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
 
 _PATHS = "_paths_"
-"""Key of a scene's YAML that lists its settings which are paths: they are made absolute, with ``~`` expanded."""
+"""Key in a scene's YAML file that lists the settings which are paths. Paths are made absolute, with ``~`` expanded."""
 
 _REQUIRED = "???"
-"""Value in a scene's YAML of a setting without a default (OmegaConf's mark for a missing value)."""
+"""Value, in a scene's YAML file, of a setting that has no default (OmegaConf's mark for a missing value)."""
 
 
 @dataclass(frozen=True)
@@ -361,8 +361,10 @@ def _read_base(spec: TaskSpec, scene: str, package: str, preset: str, options: d
 def _resolve_config(
     base: _BaseConfig, earlier: Mapping[str, Any], level: Level | None = None, values: Sequence[Assignment] = ()
 ) -> dict[str, Any]:
-    """Return the configuration as nested values, with ``${...}`` resolved. Each of these sources replaces values of the
-    one before: ``base``, ``earlier`` runs, ``level``, overrides (``values``).
+    """Return the configuration as nested values, with ``${...}`` resolved.
+
+    Values come from four sources: ``base``, ``earlier`` runs, ``level``, overrides (``values``). A later source
+    replaces values of an earlier source.
     """
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException

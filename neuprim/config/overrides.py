@@ -52,7 +52,7 @@ class CommandLine:
 
 
 def parse_overrides(overrides: Sequence[str]) -> list[Assignment]:
-    """Parse overrides ``key=value``; raise ConfigError for one that is invalid or has several values.
+    """Parse overrides ``key=value``; raise ConfigError if an override is invalid or has several values.
 
     A leading ``+`` or ``++`` has no effect, because keys are checked by name.
     """

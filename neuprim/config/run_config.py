@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
 
 _MAX_BYTES = 1_000_000
-"""Largest size of a configuration file. A real one has a few kilobytes."""
+"""Largest size of a configuration file in bytes. A real configuration has a few kilobytes."""
 
 
 @dataclass
@@ -34,7 +34,7 @@ class RunSettings:
     """The part of the configuration that is the same for every task; defaults are a run's defaults.
 
     Attributes:
-        output_dir: directory of the run, on the command line ``--out DIR``; null for a new one in ``outputs``.
+        output_dir: directory of the run, on the command line ``--out DIR``; null for a new directory in ``outputs``.
         seed: seed of every random number of the run.
         resume: continue the run in its directory from the checkpoint.
     """
@@ -67,7 +67,7 @@ class RunConfig:
         resume: whether to continue from the checkpoint in ``output_dir``, if there is one.
         overrides: overrides that the user typed.
         non_default: dotted key -> (value without overrides, value of this run), for settings where the two differ.
-        source: file that the configuration was read from; None for a new one.
+        source: file that the configuration was read from; None for a new configuration.
         made_by: packages and versions of task, scene and loss.
     """
 

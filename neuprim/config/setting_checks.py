@@ -41,7 +41,7 @@ def check_config_key(assignment: Assignment, scene: Mapping[str, Any], scene_nam
     if head == "scene" and rest:
         if rest[0] not in scene or (len(rest) > 1 and not isinstance(scene[rest[0]], Mapping)):
             own = [f"scene.{name}" for name in scene]
-            hint = nearest(key, own) or "; it has none"
+            hint = nearest(key, own) or "; this scene has no settings"
             raise ConfigError(f"{key}: no such setting of scene {scene_name!r}{hint}")
     elif head == "task":
         if rest[:1] != ["options"]:
@@ -108,7 +108,7 @@ def complete_task_options(
         if key not in declared:
             shared = [name for name in _setting_names(RunSettings) if name.rpartition(".")[2] == key]
             hint = f"; did you mean {' or '.join(map(repr, shared))}?" if shared else nearest(str(key), declared)
-            raise ConfigError(f"{where}.{key}: {owner} has no such option{hint or '; it has none'}")
+            raise ConfigError(f"{where}.{key}: {owner} has no such option{hint or ' and no other options'}")
     return {
         key: validate_value(given.get(key, option[0]), option_type_to_validate(option), f"{where}.{key}")
         for key, option in declared.items()
@@ -143,7 +143,7 @@ def check_config_parameter_names(spec: TaskSpec, settings: RunSettings) -> None:
     """Raise ConfigError for unknown parameter names under ``model.init``, ``train.rates`` and ``train.rate_units``.
 
     A name is unknown if none of the task's fields (density and colour functions) has it. Does nothing if the task does
-    not list its fields. Names that other fields of the task have, but not the chosen ones, are refused later.
+    not list its fields. A name that the chosen fields lack, but another field has, is refused later.
     """
     if not spec.fields:
         return

@@ -2,8 +2,8 @@
 
 ``neuprim run --config FILE`` and ``resume=true`` start from the settings of an earlier run.
 
-A stored configuration is untrusted. neuprim reads the files that it names. neuprim contacts an address in it, or
-writes to a folder outside the run directory, only if the user typed that setting or passed ``--trust``.
+A stored configuration is untrusted. neuprim reads the files that the configuration names. neuprim only contacts a
+network address, or writes outside the run directory, if the user typed the setting or passed ``--trust``.
 """
 
 from __future__ import annotations
@@ -70,8 +70,9 @@ def stored_settings(stored: RunConfig, same_scene: bool) -> dict[str, Any]:
     """Return key -> value of a stored run's settings, to be merged with OmegaConf.
 
     A value replaces the whole value of its key; dictionaries are not merged. A stored file may not use references
-    ``${...}``; only overrides and packages may. So that OmegaConf resolves none, a character 0 is inserted after every
-    ``$``. :func:`restore_config_references` removes it. With ``same_scene``, the settings of the scene are included.
+    ``${...}``; only overrides and packages may. A character 0 is inserted after every ``$``, so that OmegaConf
+    resolves no reference. :func:`restore_config_references` removes these characters. With ``same_scene``, the settings
+    of the scene are included.
     """
     tree = stored.to_dict()
     found = {key: tree[key] for key in ("model", "train", "renderer", "metrics", "seed")}
@@ -276,7 +277,7 @@ def config_output_directory(asked: str | None, name: str, resume: bool, check: b
     try:
         if not resume and path.is_dir() and any(path.iterdir()):
             raise ConfigError(
-                f"--out {path}: exists and is not empty; choose another, or continue its run with resume=true"
+                f"--out {path}: exists and is not empty; use another directory, or continue the run with resume=true"
             )
         there = next(p for p in (path.absolute(), *path.absolute().parents) if p.exists())
         if not there.is_dir():

@@ -47,7 +47,7 @@ class TaskChoices:
 
 @dataclass(frozen=True)
 class Level:
-    """A level of effort, 1 (fast) to 9 (good): the name of a preset, and settings that replace those of the preset."""
+    """A level of effort, 1 (fast) to 9 (good): the name of a preset, and settings that replace values of the preset."""
 
     preset: str
     settings: tuple[Assignment, ...]
@@ -84,7 +84,7 @@ def check_config_groups(spec: TaskSpec) -> None:
     """Raise ConfigError if a task's configuration package cannot be used, or lacks a file that a run would need."""
     who = f"task {spec.name!r}"
     if not spec.scenes:
-        raise ConfigError(f"{who}: its TaskSpec has no scenes")
+        raise ConfigError(f"{who}: its TaskSpec has no scenes; expected at least one")
     places = [f"task/{spec.name}.yaml", *(f"scene/{spec.name}/{scene.name}.yaml" for scene in spec.scenes)]
     for place in places:
         _require_config_file(spec.config_package, place, who)
@@ -129,7 +129,7 @@ def _read_with_defaults(
     place = f"{folder}/{name}.yaml"
     if name in readers:
         raise ConfigError(
-            f"{who}{place}: defaults: the file includes itself, perhaps through others; remove one of these defaults"
+            f"{who}{place}: defaults: the file includes itself, maybe through other files; remove one of these defaults"
         )
     own = read_task_yaml(root / folder / f"{name}.yaml", f"{who}{place}")
     names = own.pop("defaults", ["_self_"])
@@ -198,7 +198,7 @@ def choose_config_effort_level(
         raise ConfigError(f"{typed}: task {spec.name!r} has no effort levels; {instead}")
     level = levels[int(chosen)]
     if preset not in (None, level.preset):
-        found = f"this level of task {spec.name!r} uses preset={level.preset}, found preset={preset}"
+        found = f"this level of task {spec.name!r} uses preset={level.preset}, not preset={preset}"
         raise ConfigError(f"{typed}: {found}; leave out {EFFORT} or preset")
     return level
 

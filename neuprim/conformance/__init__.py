@@ -8,8 +8,8 @@
     def test_conforms(check):
         check()
 
-Each check builds tiny models on the reference backend from the task's default preset. The data are the task's
-``example``, or a small synthetic data set with the conditions that the task declares. The docstring of each check
+Each check builds tiny models on the reference backend from the task's default preset. The data set is the ``example``
+of the task's TaskSpec, or a small synthetic set with the conditions that the task declares. The docstring of each check
 states the requirement.
 """
 
@@ -78,7 +78,8 @@ __all__ = ["CHECKS", "ConformanceError", "check_task", "checks", "named_checks"]
 _NOT_THE_TASKS = ("neuprim.core", "neuprim.config", "neuprim.plugins")
 _LIBRARIES = ("torch", "numpy", "scipy", "numba", "importlib", "omegaconf", "hydra", "yaml")
 _STEPS = 4
-"""Training steps before the checkpoint, and also after it; population control runs twice in each half."""
+"""Number of training steps before the checkpoint, and again after the checkpoint. Population control runs twice in each
+half."""
 
 
 # ---------------------------------------------------------------- what a task declares
@@ -140,9 +141,9 @@ def _check_settings(t: TaskUnderTest, model: dict[str, Any], options: dict[str, 
 
 
 def check_fields_conformance(t: TaskUnderTest) -> None:
-    """Check that the settings of the density and colour field, as JSON, are enough to rebuild the field.
+    """Check that the density field and the colour field can be rebuilt from their settings, stored as JSON.
 
-    The rebuilt field must have the same parameters. The class must refuse an unknown setting.
+    A rebuilt field must have the same parameters. The class of a field must refuse an unknown setting.
     """
     for kind, field in zip(("density", "colour"), t.build_fields(), strict=True):
         name, settings = type(field).__name__, field.settings()
@@ -160,7 +161,7 @@ def check_fields_conformance(t: TaskUnderTest) -> None:
 
 
 def check_parameters_conformance(t: TaskUnderTest) -> None:
-    """Check the fields' parameters: unique names, valid shapes and rates, initial values set by the seed alone."""
+    """Check the fields' parameters: unique names, valid shapes and rates, initial values that only the seed decides."""
     taken = {s.name for s in GEOMETRY_SPECS}
     for kind, spec in t.parameter_specs():
         where = f"{kind}.parameters: {spec.name!r}"
@@ -185,10 +186,10 @@ def check_parameters_conformance(t: TaskUnderTest) -> None:
 
 
 def check_evaluation_conformance(t: TaskUnderTest) -> None:
-    """Check the functions with which a task evaluates a model, on its example data set or synthetic data.
+    """Check the functions with which a task evaluates a model, on the task's example data set or on synthetic data.
 
-    These are metrics, masks, diagnostics, facts (header entries), clips (films) and layers (images of .exr files).
-    Views of an orbit must set every condition of the task, e.g. the time.
+    The functions compute metrics, masks, diagnostics, facts (header entries), clips (films) and layers (images of .exr
+    files). Views of an orbit must set every condition of the task, e.g. the time.
     """
     task, data, model = t.task, t.dataset, t.perturbed_model(torch.float32)
     find_channels(task, data).display(data.test.pixels(0).over(data.background))
@@ -215,7 +216,10 @@ def check_evaluation_conformance(t: TaskUnderTest) -> None:
 
 
 def check_loss_conformance(t: TaskUnderTest) -> None:
-    """Check that the loss and its gradient are finite, also under a mask, and the loss is lower for the true image."""
+    """Check that the loss and its gradient are finite, and that the loss is lower for the true image.
+
+    The loss must also be finite if a mask selects some of the pixels.
+    """
     loss = t.task.loss(loss_settings(t.task, t.settings.train, t.options))
     pixels = t.dataset.train.pixels(0)
     frame = Supervision(t.dataset.train.view(0), pixels.mask, pixels.alpha)
@@ -237,7 +241,12 @@ def check_loss_conformance(t: TaskUnderTest) -> None:
 
 
 def check_channels_conformance(t: TaskUnderTest) -> None:
-    """Check that ``build``, for data of 1 and of 5 channels, returns a colour field of as many channels, or raises."""
+    """Check the colour fields that ``build`` returns for data of 1 channel and of 5 channels.
+
+    A colour field must have as many channels as the data; an image must render, and training must run.
+    ``build`` may instead raise an error, or use the same number of channels for all data. Tasks that declare channels
+    or an ``example`` are not checked.
+    """
     if t.task.example is not None or t.task.channels:
         return  # only the task knows what data of other channels would look like, or there are no others
     declared = {}
@@ -283,7 +292,7 @@ def check_resume_conformance(t: TaskUnderTest) -> None:
 def check_save_load_conformance(t: TaskUnderTest) -> None:
     """Check that a saved model loads with equal bits and images, and that compressing a model again changes no bit.
 
-    The canonical parameters, which compressed files store, must give the same images up to 1e-4.
+    Compressed files store canonical parameters, which must give the same images up to a difference of 1e-4.
     """
     model = t.perturbed_model(torch.float32)
     canonical = canonical_model(model)
@@ -310,8 +319,8 @@ def check_save_load_conformance(t: TaskUnderTest) -> None:
 def check_conditions_conformance(t: TaskUnderTest) -> None:
     """Check the task's conditions (inputs of an image besides the camera, e.g. the time).
 
-    A condition must parse the text of a valid value and refuse other text. Images must be finite over its range.
-    Rendering without its value must raise an error that names it.
+    A condition must parse the text of a valid value and refuse other text. Images must be finite over the condition's
+    range. Rendering without a value for the condition must raise an error that names the condition.
     """
     model = t.perturbed_model(torch.float32)
     view = t.views[0]
@@ -374,7 +383,7 @@ CHECKS: dict[str, Callable[[TaskUnderTest], None]] = {
 def named_checks(
     task: TaskSpec, preset: str | None = None, model: Mapping[str, Any] | None = None
 ) -> dict[str, Callable[[], None]]:
-    """Return the checks of a task by name. Each is a function without arguments that raises :class:`ConformanceError`.
+    """Return the checks of a task: name -> function without arguments, which raises :class:`ConformanceError`.
 
     Args:
         preset: name of the preset for the models' settings; None is the task's default preset.
@@ -428,7 +437,7 @@ def checks(task: TaskSpec, preset: str | None = None, model: Mapping[str, Any] |
 def _find_conformance_failure_line(error: BaseException) -> str:
     """Return where in the task's own code an error was raised, e.g. ``" in Waves.on_split (fields.py, line 12)"``.
 
-    The text is empty if no line of the traceback is the task's own.
+    The text is empty if no line of the traceback is in the task's own code.
     """
     for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
         module = str(frame.f_globals.get("__name__", ""))

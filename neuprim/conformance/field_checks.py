@@ -21,9 +21,11 @@ from neuprim.core.train.population import SPLIT_LONG, SPLIT_OTHERS, SPLIT_SHIFT
 _RAYS = 6
 """Rays per primitive."""
 _STEPS = (1e-5, 1e-6)
-"""Step sizes of finite differences. A pixel that changes at a silhouette disturbs only one of them."""
+"""Step sizes of finite differences. The gradient must agree at one of the two step sizes, because a pixel that changes
+at a silhouette disturbs the other."""
 _MASS_EACH, _MASS_MEAN = 0.25, 0.05
-"""Largest relative error of the mass (integral of density) of two split children: of one pair, and of the mean."""
+"""Largest relative errors of the mass (integral of density) of two split children: for one pair of children, and for
+the mean over all pairs."""
 
 
 # ---------------------------------------------------------------- points and rays
@@ -34,10 +36,11 @@ def _active_rows_under_test(active: ActivePrimitives) -> Tensor:
 
 
 def _integrate_under_test(active: ActivePrimitives, prim: Tensor, ray: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-    """Integrate the density sigma along P chords by Gauss-Legendre quadrature, 16 points on each of eight intervals.
+    """Integrate the density sigma along P chords (segments of rays) by Gauss-Legendre quadrature.
 
+    Each chord is divided into eight intervals, and each interval has 16 quadrature points.
     ``ray`` has origins (P, 3), directions (P, 3), and ray parameters (P,) of both ends of the chords. ``prim`` (P,) is
-    the index of each chord's primitive among the active ones. Return integrals (P,) and the largest |sigma| (P,).
+    the index of each chord's primitive among the active primitives. Return integrals (P,) and the largest |sigma| (P,).
     """
     o, d, t0, t1 = ray
     x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(16))
@@ -51,7 +54,10 @@ def _integrate_under_test(active: ActivePrimitives, prim: Tensor, ray: tuple[Ten
 def conformance_points_inside(
     geometry: Geometry, rows: Tensor, generator: torch.Generator, reach: float = 0.95
 ) -> Tensor:
-    """Draw M float64 points, (M, 3). Point i is uniform in the ellipsoid ``rows[i]``, scaled by ``reach``."""
+    """Draw M random float64 points, (M, 3). Point i is uniform in the ellipsoid with index ``rows[i]``.
+
+    The ellipsoids are first scaled by ``reach`` about their centres.
+    """
     direction = _random_directions(len(rows), generator)
     radius = reach * torch.rand(len(rows), 1, generator=generator, dtype=torch.float64) ** (1 / 3)
     local = geometry.scales.double()[rows] * direction * radius
@@ -63,7 +69,7 @@ def _random_directions(count: int, generator: torch.Generator) -> Tensor:
 
 
 def random_chords(geometry: Geometry, rows: Tensor, generator: torch.Generator) -> tuple[Tensor, ...]:
-    """Draw M random rays; ray i starts outside the ellipsoid of primitive ``rows[i]`` and passes through it.
+    """Draw M random rays; ray i starts outside the ellipsoid of primitive ``rows[i]`` and crosses the ellipsoid.
 
     Returns:
         origins (M, 3), directions (M, 3), and ray parameters (M,) of entry into and exit from the ellipsoid; float64.
@@ -140,9 +146,10 @@ def check_integral_conformance(t: TaskUnderTest) -> None:
 
 
 class _ShadingUnderTest(ColourField):
-    """Colour field that wraps a model's own, but with shading (factors on colours, e.g. shadows) computed only once.
+    """Colour field that wraps a model's colour field and computes its shading only once.
 
-    Shading has no gradient, so it must not change with parameters, or finite differences would include the change.
+    Shading is a set of factors on colours, e.g. shadows, without gradient. It must not change with the parameters,
+    because finite differences would include the change.
     """
 
     def __init__(self, model: Primitives, view: View) -> None:
@@ -165,7 +172,7 @@ class _ShadingUnderTest(ColourField):
 
 
 def _leaf_parameters_under_test(model: Primitives) -> dict[str, Tensor]:
-    """Replace the model's parameters by leaf tensors with ``requires_grad``, and return them."""
+    """Replace the model's parameters by leaf tensors with ``requires_grad``, and return the leaf tensors."""
     model.params = {name: value.detach().clone().requires_grad_() for name, value in model.params.items()}
     return model.params
 
@@ -178,7 +185,10 @@ def _conformance_objective(model: Primitives, view: View, seed: int) -> Tensor:
 
 
 def check_gradients_conformance(t: TaskUnderTest) -> None:
-    """Check that every parameter has a gradient in some view, and that float64 finite differences confirm it."""
+    """Check that every parameter has a gradient in some view, and that gradients agree with finite differences.
+
+    The finite differences are computed in float64.
+    """
     model = t.perturbed_model()
     params = _leaf_parameters_under_test(model)
     for i, view in enumerate(t.double_views):
@@ -228,7 +238,7 @@ def _compare_with_differences(t: TaskUnderTest, model: Primitives, view: View, n
 
 
 def check_scaling_conformance(t: TaskUnderTest) -> None:
-    """Check that ``scale_density`` multiplies each primitive's density by the given factor and returns new tensors."""
+    """Check that ``scale_density`` multiplies each primitive's density by a factor, and returns new tensors."""
     model = t.perturbed_model()
     factor = torch.linspace(0.25, 2.0, model.count, dtype=torch.float64)
     own = model.of(model.density)
@@ -282,10 +292,11 @@ def check_split_conformance(t: TaskUnderTest) -> None:
 def _require_conforming_masses(
     t: TaskUnderTest, model: Primitives, children: list[tuple[dict[str, Tensor], Geometry]]
 ) -> None:
-    """Require that two children together have the mass of the primitive that they replace, the integral of |sigma|.
+    """Require that two children together have the mass of their parent, the primitive that the children replace.
 
-    The tolerance is larger for one pair than for the mean over all pairs, since sigma can vary within a primitive.
-    ``children`` has two pairs (parameters, ellipsoids), each for one child of every primitive.
+    The mass is the integral of |sigma|. The tolerance is larger for one pair of children than for the mean over all
+    pairs, because sigma can vary within a primitive. ``children`` has two elements (parameters, ellipsoids): the first
+    children of all primitives, and the second children.
     """
     view = t.double_views[0]
     ball = 2 * torch.rand(4000, 3, generator=torch.Generator().manual_seed(8), dtype=torch.float64) - 1
@@ -313,7 +324,7 @@ def _require_conforming_masses(
 def check_reductions_conformance(t: TaskUnderTest) -> None:
     """Check the reductions that density and colour fields offer: smaller values of a setting, e.g. of the SH degree.
 
-    A reduced field must be one that the task lists, have fewer parameters, and give finite images.
+    The task must list the class of a reduced field. The field must have fewer parameters and give finite images.
     """
     model = t.perturbed_model(torch.float32)
     for kind, field in (("density", model.density), ("colour", model.colour)):

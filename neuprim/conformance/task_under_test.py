@@ -1,4 +1,4 @@
-"""The class of a task under test, from which conformance checks build models, data and trainers; synthetic data."""
+"""The class :class:`TaskUnderTest`, with which checks build models, data and trainers; and a synthetic data set."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ from neuprim.core.train.trainer import Trainer
 
 PRIMITIVES = 12
 EXACT = RenderSettings(backend=REFERENCE, alpha_max=0.9999, alpha_min=0.0, transmittance_min=0.0, depth_floor=1e-12)
-"""Render settings, for the float64 reference, that skip no contribution to a pixel and clamp as little as possible."""
+"""Render settings for the float64 reference backend. They skip no contribution to a pixel, and clamp as little as
+possible."""
 
 
 class ConformanceError(AssertionError):
@@ -124,7 +125,7 @@ class TaskUnderTest:
 
     @cached_property
     def dataset(self) -> Dataset:
-        """Example data set of the task, or a synthetic one with the conditions and channels that the task declares."""
+        """Example data set of the task; if there is none, a synthetic set with the task's conditions and channels."""
         if self.task.example is not None:
             return self.task.example()
         return conformance_dataset(self.task.conditions, len(self.task.channels) or 3)
@@ -154,9 +155,9 @@ class TaskUnderTest:
         return [*(("density", s) for s in density.parameters()), *(("colour", s) for s in colour.parameters())]
 
     def lower_method(self, parameter: str) -> str:
-        """Return the method through which a parameter affects the image, for messages, e.g. ``"density.lower: "``.
+        """Return, for messages, the method of the field that uses a parameter, e.g. ``"density.lower: "``.
 
-        The text is empty for parameters of the ellipsoids.
+        The text is empty for parameters of the ellipsoids, which belong to no field.
         """
         kind = next((kind for kind, spec in self.parameter_specs() if spec.name == parameter), None)
         return "" if kind is None else f"{kind}.lower: "
@@ -199,7 +200,10 @@ _NEAR_ZERO = 3.0
 
 
 def conformance_range(spec: ConditionSpec) -> tuple[float, float]:
-    """Return the interval from which checks draw a condition: the part of its range within -3..3, or else the range."""
+    """Return the interval from which checks draw the values of a condition.
+
+    The interval is the part of the condition's range within -3..3, or the whole range if that part is empty.
+    """
     low, high = max(spec.range[0], -_NEAR_ZERO), min(spec.range[1], _NEAR_ZERO)
     return (low, high) if low < high else spec.range
 

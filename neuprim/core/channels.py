@@ -28,7 +28,7 @@ class Channels:
     """The channels of a task's images.
 
     Attributes:
-        names: one per channel, in the order of the tensors' last axis.
+        names: one name per channel, in the order of the tensors' last axis.
         color_space: colour space of the data set, "srgb" or "linear".
         own: the task's function for display, :attr:`TaskSpec.display <neuprim.core.task.TaskSpec.display>`, or None.
         task: name of the task, for messages.
@@ -46,9 +46,10 @@ class Channels:
 
     @property
     def rgb(self) -> tuple[int, int, int] | None:
-        """Indices of the channels named R, G and B; without these names, of those to show as red, green and blue.
+        """Indices of the channels that are shown as red, green and blue: those named R, G and B.
 
-        The latter are (0, 1, 2) for three channels and (0, 0, 0) for one; None for other numbers.
+        Without these names, the indices are (0, 1, 2) for three channels and (0, 0, 0) for one channel. For other
+        numbers of channels, the property is None.
         """
         if {"R", "G", "B"} <= set(self.names):
             return self.names.index("R"), self.names.index("G"), self.names.index("B")
@@ -61,12 +62,15 @@ class Channels:
 
     @property
     def hides_channels(self) -> bool:
-        """Whether pictures show only some of the channels, because the task has no function for display."""
+        """Whether the task has no function for display, and the channels are not one or three.
+
+        Pictures then show at most three of the channels.
+        """
         return self.own is None and self.count not in (1, 3)
 
     @property
     def display_text(self) -> str:
-        """Text that tells users which channels the pictures show, and how; empty for plain RGB or grey."""
+        """Text that tells users which channels the pictures show, and in which colours; empty for plain RGB or grey."""
         if self.own is not None:
             return f"{self.name_list} through the display of task {self.task!r}"
         if self.names == default_exr_channel_names(self.count) and not self.hides_channels:
@@ -91,11 +95,11 @@ class Channels:
     def display(self, image: Tensor) -> Tensor:
         """Convert an image (H, W, C) in the data set's colour space to display-referred sRGB (H, W, 3).
 
-        The task's function for display returns values in 0..1. Tasks without one: linear values get the sRGB curve, and
-        values are not clamped at 1.
+        If the task has a function for display, this function converts the image, and values are clamped to 0..1.
+        Otherwise, linear values get the sRGB curve, and values are not clamped at 1.
 
         Raises:
-            ConfigError: the task's function for display returned something else.
+            ConfigError: the task's function for display returned no tensor (H, W, 3) of finite floats.
         """
         if image.shape[-1] != self.count:
             raise ValueError(
@@ -130,11 +134,14 @@ class Channels:
 
 
 def find_channels(task: TaskSpec, dataset: Dataset) -> Channels:
-    """Return the channels of a task's data set; raises DataError if the data set has another number of channels than
-    the task, or a background that does not fit the channels."""
+    """Return the channels of a task's data set.
+
+    Raises DataError if the data set has another number of channels than the task, or if its background does not fit the
+    number of channels.
+    """
     if task.channels and len(task.channels) != dataset.channels:
         named = f"{len(task.channels)}, the channels of task {task.name!r}: {', '.join(task.channels)}"
-        raise DataError(f"{dataset.name}: {dataset.channels} channels; expected {named}")
+        raise DataError(f"{dataset.name}: images have {dataset.channels} channels; expected {named}")
     if (shape := tuple(dataset.background.shape)) != (dataset.channels,):
         expected = f"({dataset.channels},), one number per channel"
         raise DataError(f"{dataset.name}: the background has shape {shape}; expected {expected}")
@@ -147,7 +154,7 @@ def read_stored_channels(where: Path, header: Mapping[str, Any], task: TaskSpec,
 
     Args:
         where: the model's run directory, for messages.
-        header: the JSON header of the model file.
+        header: the JSON header of the model's file.
         count: number of colour channels of the model.
 
     Raises:

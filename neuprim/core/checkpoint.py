@@ -1,8 +1,8 @@
-"""Models and checkpoints on disk: safetensors with one JSON header. Nothing in a file is ever executed.
+"""Model files and checkpoint files: safetensors with one JSON header. Reading a file never executes its content.
 
-A *model* holds what rendering needs and nothing else; a *checkpoint* holds the exact training state. A model may also
-be a compressed file (:mod:`neuprim.core.compression`). All readers of models accept plain and compressed files, and
-recognise them by their first bytes.
+A *model* file holds only what rendering needs; a *checkpoint* holds the exact training state. A model file may also be
+compressed (:mod:`neuprim.core.compression`). All functions that read models accept plain and compressed files, and
+recognise the kind by the first bytes.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], header: 
 
 
 def read_header(path: Path, kind: str) -> dict[str, Any]:
-    """Return the JSON header of a file of this kind, "model" or "checkpoint"; reads no tensor.
+    """Return the JSON header of a file without reading a tensor; ``kind`` is "model" or "checkpoint".
 
     Raises:
         CheckpointError: the file is missing, truncated, written by another program, or of another format version.
@@ -103,7 +103,7 @@ def _check_model_header(path: Path, header: Any, kind: str) -> dict[str, Any]:
 
 
 def shapes(path: Path, kind: str) -> dict[str, tuple[int, ...]]:
-    """Return tensor name -> shape for a file that is not compressed; reads no tensor."""
+    """Return tensor name -> shape of a file that is not compressed, without reading a tensor."""
     read_header(path, kind)
     with safe_open(str(path), framework="pt") as file:
         return {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}
@@ -115,7 +115,8 @@ def read_tensors(
     """Return the JSON header and the tensors of a file; refuse a header that claims more data than the file has.
 
     Args:
-        rows: function (tensor name, shape) -> rows to read, or None for all rows. Compressed files are read whole.
+        rows: function (tensor name, shape) -> slice of the rows to read, or None for all rows. For compressed files,
+            all rows are read and this argument is ignored.
     """
     if is_compressed(path):
         header, tensors, _ = read_compressed(path)
@@ -159,7 +160,9 @@ def save_compressed(
     bits: BitTable | Quantizers,
     config: str | None = None,
 ) -> dict[str, StoredSize]:
-    """Write a quantised model file; return the stored size of each parameter. Other arguments: :func:`save_model`.
+    """Write a quantised model file (``.neuprim``); return parameter name -> stored size.
+
+    The arguments ``path``, ``task`` and ``extra`` are those of :func:`save_model`.
 
     Args:
         bits: bits per parameter, or quantizers fitted to ``model``, which must then be a :func:`canonical_model`.

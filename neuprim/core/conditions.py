@@ -1,9 +1,9 @@
 """Read the conditions of a task, such as time or light, from command-line text, and check their ranges.
 
 Users write ``--NAME TEXT`` or ``--NAME=TEXT``, with ``-`` or ``_`` inside the name. A condition that is one number
-accepts a number, a list ``A,B,C``, or a range ``FIRST:LAST`` or ``FIRST:LAST:COUNT``. Each value is a frame, and
-:attr:`ConditionSpec.parse <neuprim.core.model.fields.ConditionSpec>` reads one number. The task alone parses the text
-of any other condition, such as ``x,y,z`` or ``orbit`` for a light.
+accepts a number, a list ``A,B,C``, or a range ``FIRST:LAST`` or ``FIRST:LAST:COUNT``. Each value of the list or range
+gives one frame. The task's :attr:`ConditionSpec.parse <neuprim.core.model.fields.ConditionSpec>` reads each number. For
+any other condition, ``parse`` reads the whole text, such as ``x,y,z`` or ``orbit`` for a light.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def condition_flag(name: str) -> str:
 
 
 def named(word: str, specs: Sequence[ConditionSpec]) -> str | None:
-    """Return the name of the condition that ``word`` names, written with ``-`` or ``_``; None if there is none."""
+    """Return the name of the condition that ``word`` means, written with ``-`` or ``_``; None if there is none."""
     return next((spec.name for spec in specs if spec.name.replace("-", "_") == word.replace("-", "_")), None)
 
 
@@ -79,7 +79,7 @@ def parse_frame_numbers(text: str) -> list[int]:
     """Return the frame numbers of ``--frame``: numbers and ranges FIRST-LAST or FIRST-LASTxSTEP, separated by commas.
 
     Raises:
-        ConfigError: anything else, or more than 100,000 frames.
+        ConfigError: the text has another form, or gives more than 100,000 frames.
     """
     numbers: list[int] = []
     for part in text.split(","):
@@ -92,9 +92,10 @@ def parse_frame_numbers(text: str) -> list[int]:
 
 
 def source_frames(header: Mapping[str, Any]) -> tuple[int, int] | None:
-    """Return the numbers of the first and the last frame of the files that a model was fitted to, at times 0 and 1.
+    """Return the numbers of the first and the last frame of the files from which a model was trained.
 
-    Returns None if the header of the model names no numbered frames; raises DataError if it is invalid.
+    These frames have the times 0 and 1. Returns None if the model's header names no numbered frames; raises DataError
+    if the header is invalid.
     """
     facts = header.get("data")
     if not isinstance(facts, dict) or "frames" not in facts:
@@ -104,7 +105,11 @@ def source_frames(header: Mapping[str, Any]) -> tuple[int, int] | None:
 
 
 def frame_numbers(header: Mapping[str, Any], frames: Sequence[Mapping[str, Tensor]]) -> list[int]:
-    """Return the numbers that the source's files have, or would have, at the times of ``frames``; else 0, 1, ..."""
+    """Return the numbers of the source files at the times of ``frames``.
+
+    If a time lies between two files, if numbers repeat, or if ``header`` names no numbered files, return 0, 1, ...
+    instead.
+    """
     known = source_frames(header)
     if known is not None and all("time" in conditions for conditions in frames):
         exact = [known[0] + float(conditions["time"]) * (known[1] - known[0]) for conditions in frames]
@@ -125,7 +130,7 @@ def frames_to_times(
         header: header of the model.
 
     Raises:
-        ConfigError: the model has no such frames, or ``conditions`` has times, too.
+        ConfigError: the model has no frame with such a number, or ``conditions`` also has the condition "time".
     """
     numbers, known = parse_frame_numbers(text), source_frames(header)
     if known is None:
@@ -134,7 +139,7 @@ def frames_to_times(
         raise ConfigError("--frame and --time: give only one of these flags")
     first, last = known
     if min(numbers) < first or max(numbers) > last:
-        raise ConfigError(f"--frame {text}: the sequence has frames {first} to {last}")
+        raise ConfigError(f"--frame {text}: not in the sequence; expected frames from {first} to {last}")
     times = ",".join(repr((number - first) / max(last - first, 1)) for number in numbers)
     return numbers, {**conditions, "time": times}
 
@@ -143,7 +148,8 @@ def frame_interval(header: Mapping[str, Any], times: Iterable[float]) -> float |
     """Return the time between two frames, in units of the condition "time"; None if it is unknown.
 
     Args:
-        header: header of the model. If it names no source frames, the result is the mean distance of ``times``.
+        header: header of the model. If the header names no source frames, the result is the mean distance between
+            neighbouring ``times``.
         times: times of the frames that are rendered or exported.
     """
     frames, ordered = source_frames(header), sorted(set(times))
@@ -160,7 +166,8 @@ def read_conditions(
 ) -> dict[str, list[Tensor]]:
     """Parse the texts of conditions; return condition name -> values, one per frame, in the task's order.
 
-    An animation that states no number of frames (``0:1``, ``orbit``) gets as many frames as the other conditions.
+    An animation such as ``0:1`` or ``orbit`` need not state its number of frames. Without this number, the animation
+    gets as many frames as the other conditions.
 
     Args:
         texts: condition name -> text, for the conditions that the user gave.
@@ -183,7 +190,7 @@ def read_conditions(
 
 
 def count_condition_frames(texts: Mapping[str, str], found: Mapping[str, Sequence[Tensor]]) -> int:
-    """Return the number of frames that the values ``found`` have in common; a single value holds in all frames.
+    """Return the common number of frames of the conditions ``found``; a condition with one value is constant.
 
     Raises ConfigError if two conditions have different numbers of frames.
     """
@@ -199,7 +206,10 @@ def count_condition_frames(texts: Mapping[str, str], found: Mapping[str, Sequenc
 
 
 def _condition_with_frame_count(spec: ConditionSpec, text: str, count: int) -> str | None:
-    """Return the animation ``text`` with a count of frames added; None if it has a count, or is no animation."""
+    """Return the animation ``text`` with a number of frames added.
+
+    Return None if the text already states a number of frames, or is no animation.
+    """
     if spec.shape:
         return spec.in_frames(text, count)
     found = _RANGE.fullmatch(text.strip())
@@ -219,7 +229,7 @@ def _read_condition(spec: ConditionSpec, text: str, warn: Warn) -> list[Tensor]:
 
 
 def _read_condition_number_or_range(spec: ConditionSpec, text: str) -> list[Tensor]:
-    """Read one number or range; a range that the task's ``parse`` refuses is expanded here."""
+    """Read one number or range. If the task's ``parse`` refuses a range, this function expands the range."""
     try:
         return _condition_values_from_text(spec, text)
     except NeuprimError:
@@ -264,10 +274,10 @@ def _format_condition_number(number: float) -> str:
 
 
 def _check_condition_range(spec: ConditionSpec, text: str, values: Sequence[Tensor], warn: Warn) -> None:
-    """Check a condition's values against its range; ``warn`` of values outside, or raise ConfigError if it is strict.
+    """Check a condition's values against the condition's range.
 
-    Values that are not finite always raise ConfigError. Bounds are rounded to the dtype of the values, so that float32
-    0.3 lies within 0 to 0.3.
+    For values outside, call ``warn``, or raise ConfigError if the condition is strict. Values that are not finite
+    always raise ConfigError. Bounds are rounded to the dtype of the values, so that float32 0.3 lies within 0 to 0.3.
     """
     low, high = spec.range
     shown = f"{condition_flag(spec.name)} {text}"
@@ -295,8 +305,10 @@ def _first_where(value: Tensor, where: Tensor) -> float:
 def conditions_per_frame(
     specs: Sequence[ConditionSpec], texts: Mapping[str, str], several: bool = False
 ) -> list[dict[str, Tensor]]:
-    """Return condition name -> value for each frame. Raises ConfigError if a condition of ``specs`` has no text, or for
-    several frames unless ``several``."""
+    """Return condition name -> value for each frame.
+
+    Raises ConfigError if a condition in ``specs`` has no text, or if there are several frames and ``several`` is False.
+    """
     for spec in specs:
         if spec.name not in texts:
             what = f"{condition_flag(spec.name)}: required, as the model depends on it ({spec.unit})"

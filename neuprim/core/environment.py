@@ -1,16 +1,17 @@
-"""Environment maps: a latitude-longitude image of the light from all directions, and a few lights that approximate it.
+"""Environment maps: latitude-longitude images of the light from all directions, and lights that approximate them.
 
-The top row of the image is up, the bottom row down. The middle column looks along the first horizontal axis. From there
-to the right, directions turn clockwise about up, as seen from above. With up = +z, the middle column is +x, a quarter
-of the image to the right is -y, both edges are -x, and a quarter to the left is +y, as in Blender's environment
-textures. For another up, the first horizontal axis is the scene's x (y if x is up), made perpendicular to up; the
-second, a quarter to the left, is up x first. A rotation turns the light anticlockwise about up as seen from above:
-after 90 degrees, light that came from +x comes from +y.
+The top row of the image is the upward direction ("up"), the bottom row the downward direction. The middle column looks
+along the first horizontal axis. From the middle column to the right, directions turn clockwise about up, as seen from
+above. With up = +z, the middle column is +x, a quarter of the image to the right is -y, both edges are -x, and a
+quarter to the left is +y, as in Blender's environment textures. For another up, the first horizontal axis is the
+scene's x (y if x is up), made perpendicular to up. The second horizontal axis, a quarter to the left, is the cross
+product of up and the first axis. A rotation turns the light anticlockwise about up as seen from above: after 90
+degrees, light that came from +x comes from +y.
 
-Directions of lights are chosen by cutting the image into rectangles, one light each. Each cut is the one that most
-lowers the sum over all rectangles of the variance of direction weighted by energy (Viriyothai and Debevec 2009,
-"Variance minimization light probe sampling"; not the median cut). Each light carries the whole energy of its rectangle,
-so the total energy per colour is that of the image for any number of lights.
+To choose the directions of the lights, the image is cut into rectangles, and each rectangle becomes one light. Each cut
+is the one that most lowers a sum over all rectangles: the variance of direction, weighted by energy (Viriyothai and
+Debevec 2009, "Variance minimization light probe sampling"; not the median cut). Each light carries the whole energy of
+its rectangle. So the total energy per colour is the energy of the image, whatever the number of lights.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class EnvironmentFile:
     """An environment map and how to use it, as ``neuprim render --environment`` takes it."""
 
     path: Path  # image that read_environment reads
-    samples: int = 64  # number of lights that approximate it
+    samples: int = 64  # number of lights that approximate the environment map
     rotation: float = 0.0  # degrees about the scene's upward direction
     scale: float = 1.0  # multiplies the radiance
     guesses: bool = True  # whether to use light from directions without training data
@@ -51,8 +52,8 @@ class EnvironmentFile:
 class DirectionalLights:
     """M distant lights, each with parallel rays from one direction."""
 
-    directions: Tensor  # (M, 3) float64 unit vectors towards where the light comes from, scene axes
-    irradiance: Tensor  # (M, 3) float64 linear RGB on a surface that faces it: radiance times solid angle
+    directions: Tensor  # (M, 3) float64 unit vectors from the scene towards the light, scene axes
+    irradiance: Tensor  # (M, 3) float64 linear RGB on a surface that faces the light: radiance times solid angle
 
 
 @dataclass(frozen=True)
@@ -62,13 +63,16 @@ class Illumination:
     ``TaskSpec.environment`` returns an ``Illumination``.
     """
 
-    conditions: tuple[dict[str, Tensor], ...]  # per frame; they replace the view's conditions of the same names
+    conditions: tuple[dict[str, Tensor], ...]  # per frame: values that replace the view's conditions of the same names
     notes: tuple[str, ...] = ()  # one line each, for the user
-    guessed: tuple[bool, ...] = ()  # whether the light of a frame has no training data nearby; empty if none has
+    # per frame: True if no training light is near the frame's light; empty if this holds for no frame
+    guessed: tuple[bool, ...] = ()
 
     def frames(self, guesses: bool) -> tuple[dict[str, Tensor], ...]:
-        """Return the conditions of each frame. Without ``guesses``, leave out frames whose light has no training data
-        nearby; the result may be empty."""
+        """Return the conditions of each frame.
+
+        Without ``guesses``, leave out frames whose light has no training light nearby; the result may be empty.
+        """
         if guesses or not any(self.guessed):
             return self.conditions
         return tuple(c for c, guess in zip(self.conditions, self.guessed, strict=True) if not guess)
@@ -98,14 +102,17 @@ class Environment:
 
     @property
     def irradiance(self) -> Tensor:
-        """Sum of radiance times solid angle over all directions, (3,) float64, without cosine: 4 pi for radiance 1."""
+        """Integral of the radiance over all directions, (3,) float64, without a cosine factor.
+
+        For the radiance 1 in all directions, the integral is 4 pi.
+        """
         return torch.from_numpy(self._flux.sum((0, 1)))
 
     def directional_lights(self, count: int) -> DirectionalLights:
-        """Return at most ``count`` lights (1 to 4096) that together carry all energy of the image.
+        """Return at most ``count`` lights that together carry all energy of the image; ``count`` is 1 to 4096.
 
-        There are fewer lights if fewer cells of the image are bright, and none if the image is black. The choice is
-        deterministic.
+        If fewer cells (blocks of texels) of the image are bright, there are fewer lights. A black image gives no light.
+        The choice is deterministic.
         """
         if not 1 <= count <= MAX_LIGHTS:
             raise ConfigError(f"{count} lights for an environment; expected 1 to {MAX_LIGHTS}")
@@ -122,8 +129,11 @@ class Environment:
         return DirectionalLights(*map(torch.from_numpy, arrays))
 
     def share_beyond(self, directions: Tensor, degrees: float) -> float:
-        """Return the fraction 0..1 of the luminance whose direction is more than ``degrees`` away from each of the unit
-        vectors ``directions`` (D, 3)."""
+        """Return the fraction 0..1 of the luminance that comes from far outside the given ``directions``.
+
+        Luminance counts if its direction is more than ``degrees`` away from each of the unit vectors ``directions`` (D,
+        3).
+        """
         weight = self._flux @ _LUMINANCE
         total = float(weight.sum())
         if total == 0.0:
@@ -139,7 +149,9 @@ class Environment:
 
 
 def read_environment(path: Path, up: Tensor | None = None, rotation: float = 0.0, scale: float = 1.0) -> Environment:
-    """Read an environment from an OpenEXR file (linear), or a PNG or JPEG (sRGB, made linear); alpha is ignored.
+    """Read an environment map from an OpenEXR file (linear), or from a PNG or JPEG file (sRGB, converted to linear).
+
+    Alpha is ignored.
 
     Args:
         up: see :class:`Environment`.
@@ -175,7 +187,7 @@ def _environment_axes(up: Tensor) -> Array:
 def _sum_texel_blocks(radiance: Tensor, axes: Array, turn: float, where: str) -> tuple[Array, Array]:
     """Sum an environment map over blocks of texels; return flux and direction sums, (R, C, 3) for R x C blocks.
 
-    The flux is radiance x solid angle, per colour channel. The direction sum is that of the flux's luminance x
+    The flux is radiance x solid angle, per colour channel. The direction sum is the sum of (luminance of the flux) x
     direction. ``turn`` is the rotation in radians, ``where`` the image's name in messages.
     """
     height, width = radiance.shape[:2]
@@ -207,7 +219,7 @@ def _sum_texel_blocks(radiance: Tensor, axes: Array, turn: float, where: str) ->
 def _cut_environment_into_rectangles(moment: Array, weight: Array, count: int) -> list[tuple[int, int, int, int]]:
     """Return at most ``count`` rectangles (first row, end, first column, end) that contain all cells with energy.
 
-    ``moment`` (R, C, 3) is the sum of luminance x direction in each cell, ``weight`` (R, C) that of luminance.
+    ``moment`` (R, C, 3) is the sum of luminance x direction in each cell, ``weight`` (R, C) the sum of luminance.
     """
     rows, columns = weight.shape
     table = np.zeros((rows + 1, columns + 1, 4))
@@ -234,8 +246,11 @@ def _sum_rectangle(table: Array, box: tuple[int, int, int, int]) -> Array:
 
 
 def _direction_spread(sums: Array) -> Array:
-    """Return energy x variance of direction, W - |M|^2/W, from sums (..., 4): luminance x direction M, then luminance
-    W."""
+    """Return energy x variance of direction, W - |M|^2/W, from ``sums`` (..., 4).
+
+    The first three numbers of ``sums`` are M, the sum of luminance x direction. The last number is W, the sum of
+    luminance.
+    """
     weight = sums[..., 3]
     return np.asarray(np.maximum(weight - (sums[..., :3] ** 2).sum(-1) / np.maximum(weight, 1e-300), 0.0))
 
@@ -245,7 +260,8 @@ def _cut_environment_rectangle(
 ) -> list[tuple[int, int, int, int]]:
     """Return the two parts after the best cut of rectangle ``box``; empty if no cut lowers the spread by ``least``.
 
-    ``table`` (R + 1, C + 1, 4) holds cumulative sums of the values that :func:`_direction_spread` reads.
+    The spread is the value of :func:`_direction_spread`. ``table`` (R + 1, C + 1, 4) holds cumulative sums of the
+    values that this function reads.
     """
     r0, r1, c0, c1 = box
     whole = _sum_rectangle(table, box)

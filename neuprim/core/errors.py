@@ -1,8 +1,9 @@
 """Errors that a user can correct, and warnings.
 
-The command line prints such an error as one line and exits with status 2. Any other exception is a bug and keeps its
-traceback. A warning does not stop a command; each is one line, given once per process. Warnings are Python warnings, so
-that notebooks and programs can filter them; the command line shows them on standard error.
+The command line prints an error that a user can correct as one line, and exits with status 2. Any other exception is a
+bug and keeps its traceback. A warning does not stop a command. Each warning is one line, given once per process.
+Warnings are Python warnings, so that notebooks and programs can filter them. The command line shows warnings on
+standard error.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ DISK = (
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO),
     *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP),
 )
-"""Codes of operating-system errors about disks and paths that users can correct, without ENOENT: a missing file may be
-a bug."""
+"""Codes of operating-system errors about disks and paths that users can correct. ENOENT is not among them, because a
+missing file may be a bug."""
 
 
 class NeuprimError(Exception):
@@ -47,11 +48,11 @@ class BackendUnavailable(NeuprimError):
 
 
 class NonFiniteError(NeuprimError):
-    """A parameter, gradient or loss became NaN or infinite; the message names parameter and primitive."""
+    """A parameter, gradient, loss or image is NaN or infinite; the message says where the value is."""
 
 
 class DeviceMemoryError(NeuprimError):
-    """The memory of a GPU is full; the message says what uses it and what to lower."""
+    """The memory of a GPU is full; the message says what uses the memory and which settings to lower."""
 
 
 class RankError(NeuprimError):
@@ -71,14 +72,18 @@ class FormError(NeuprimError):
 
 
 def cut_error_text(text: str, most: int = 80) -> str:
-    """Shorten a text to at most ``most`` characters; for values from files and users that messages quote."""
+    """Shorten a text to at most ``most`` characters.
+
+    Error messages shorten the values that they quote from files and users.
+    """
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def nearest(name: str, choices: Iterable[str], limit: int = 3, prefix: str = "") -> str:
-    """Return a hint for the end of an error message: the closest of ``choices``, ``"; did you mean 'a' or 'b'?"``.
+    """Return a hint for the end of an error message, such as ``"; did you mean 'a' or 'b'?"``.
 
-    The hint writes ``prefix`` before each name. If no name is close, it lists all choices.
+    The hint lists the ``choices`` that are closest to ``name``, with ``prefix`` before each. If no choice is close, the
+    hint lists all choices.
     """
     options = sorted(set(choices))
     close = difflib.get_close_matches(name[:200], options, n=limit, cutoff=0.5)
@@ -88,7 +93,7 @@ def nearest(name: str, choices: Iterable[str], limit: int = 3, prefix: str = "")
 
 
 _HEAD, _TAIL = 1200, 300
-"""Characters that remain of a long message: its beginning, with file and key, and its end. The value between is cut."""
+"""Number of characters kept at the beginning and at the end of a long message. The beginning names file and key."""
 
 _FULL_GPU = (
     "the GPU's memory is full; expected a smaller image or grid, fewer primitives, or CUDA_VISIBLE_DEVICES= in the "
@@ -125,7 +130,10 @@ def warn_once(text: str) -> None:
 
 @contextmanager
 def warnings_as_lines() -> Iterator[None]:
-    """Print neuprim's warnings inside the block as ``neuprim: warning: ...`` on standard error; leave others."""
+    """Print neuprim's warnings inside the block as ``neuprim: warning: ...`` on standard error.
+
+    Warnings of other packages are shown as before.
+    """
     previous = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:

@@ -1,6 +1,6 @@
 """Interfaces of plugins other than tasks: scenes and losses, export formats, and ways to show a density.
 
-Each kind has its own entry-point group; :mod:`neuprim.plugins.registry` finds and loads them.
+Each kind of plugin has its own entry-point group; :mod:`neuprim.plugins.registry` finds and loads plugins.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ class TrainedModel:
     Attributes:
         header: header of ``model.safetensors``: background, colour space, data source, iterations, ...
         dataset: loads the scene again; raises :class:`~neuprim.core.errors.DataError` if its files are gone.
-        volume: opens the voxel files of the scene, or returns None for scenes without; raises as ``dataset`` does.
+        volume: opens the voxel files of the scene, or returns None for scenes without voxel files; raises the errors of
+            ``dataset``.
     """
 
     directory: Path  # directory of the run
@@ -67,10 +68,12 @@ class ExportJob:
         out: path of the file to write or folder to create, inside a temporary folder. If the export succeeds, neuprim
             moves everything in the temporary folder to its destination. So exporters need not handle ``--force`` or
             clean up after a failure.
-        options: value of every option: the user's, as a number or boolean if it is one, or the default.
+        options: option name -> the user's value, or else the default. A value that reads as a number or boolean is
+            converted.
         conditions: condition name -> text, already checked; empty unless the exporter takes conditions.
         progress: function to call with (text, fraction 0..1).
-        frame: the conditions of the only frame to write, of a sequence; None: those of ``conditions``.
+        frame: conditions of the single frame to write, if neuprim exports a sequence frame by frame. None means that
+            ``conditions`` gives the frames.
     """
 
     run: TrainedModel  # the model to export
@@ -85,7 +88,8 @@ class ExportJob:
 
         Args:
             several: whether more than one frame is allowed.
-            names: conditions that the export depends on; None: all of the task's. Other conditions are refused.
+            names: conditions that the export depends on; None for all conditions of the task. Other conditions are
+                refused.
         """
         if self.frame is not None:
             return [dict(self.frame)]
@@ -119,10 +123,10 @@ class ExportReport:
     """Files that an exporter wrote, and what the format lost.
 
     Attributes:
-        files: the files, in order; each is :attr:`ExportJob.out` itself, inside it, or next to it.
+        files: the files, in order. Each file is :attr:`ExportJob.out` itself, inside this folder, or next to it.
         lossless: whether importing the files restores the model exactly.
-        errors: measured agreement of the export with the model, by name: ``{"psnr": 31.2}``; may be empty.
-        notes: lines for the user: conventions, frames, what is left out.
+        errors: metrics that compare the export with the model, by name: ``{"psnr": 31.2}``; may be empty.
+        notes: lines for the user about conventions, frames and what is left out.
     """
 
     files: tuple[Path, ...]
@@ -145,15 +149,16 @@ class Exporter:
     """An export format, ``neuprim export --format NAME``; entry-point group ``neuprim.exporters``.
 
     Attributes:
-        write: writes :attr:`ExportJob.out`; raises a :class:`~neuprim.core.errors.NeuprimError` for what the format
-            cannot hold.
+        write: function that writes :attr:`ExportJob.out`. It raises a :class:`~neuprim.core.errors.NeuprimError` if the
+            format cannot hold the model.
         options: option name -> (default, one line of help); shown by ``neuprim export --format NAME --help``.
-        read: for lossless formats: the function of ``neuprim import``, which reads a file that ``write`` wrote. The
-            file is untrusted; raises :class:`~neuprim.core.errors.DataError`. ``neuprim import`` finds the exporter by
-            the file's suffix, which is the exporter's name.
-        default: name of the file or folder in ``RUN_DIR/export``; "" for the exporter's name with the first suffix.
+        read: for lossless formats, the function with which ``neuprim import`` reads a file that ``write`` wrote. The
+            file is untrusted; a damaged file raises :class:`~neuprim.core.errors.DataError`. ``neuprim import`` finds
+            the exporter by the file's suffix, which must be the exporter's name.
+        default: default name of the file or folder in ``RUN_DIR/export``; "" for the exporter's name with the first
+            suffix.
         suffixes: allowed suffixes, if the format is a single file: ``(".glb", ".ply")``; other names and folders are
-            refused. Empty: the user may give any name of a file or folder.
+            refused. If this is empty, the user may give any name of a file or folder.
         sequence: whether neuprim calls ``write`` once per frame if the user asks for several frames. The files
             NAME.0001.ply, ... are then in a folder.
     """
@@ -175,10 +180,12 @@ class Inspector:
     """A way to show a density, ``neuprim inspect --show NAME``; entry-point group ``neuprim.inspectors``.
 
     Attributes:
-        layers: a :class:`~neuprim.inspect.field.InspectionFrame` -> a list of layers of :mod:`neuprim.inspect.layers`,
-            called once per frame and panel. Windows, pictures, films and web pages draw these layers.
-        shows: "sigma": the extinction on the frame's grid, with a second panel for the ground truth if there is one;
-            "model": the primitives; "primitive": a single one, with its own camera; "both": needs the ground truth.
+        layers: function :class:`~neuprim.inspect.field.InspectionFrame` -> list of layers of
+            :mod:`neuprim.inspect.layers`, called once per frame and panel. Windows, pictures, films and web pages draw
+            these layers.
+        shows: what the inspector shows. "sigma" is the extinction on the frame's grid, with a second panel for the
+            ground truth if there is one. "model" is all primitives. "primitive" is a single primitive, with its own
+            camera. "both" is the model together with the ground truth, which must exist.
     """
 
     api: int  # the API_VERSION that the inspector was written for
@@ -203,9 +210,9 @@ class LossExtension:
     """A training loss for any task, ``train.loss=NAME``; entry-point group ``neuprim.losses``.
 
     Attributes:
-        make: (settings under ``train``, with the options of the loss as "options") -> the loss.
-        options: name -> (default, one line of help), set by users as ``task.options.NAME``; the rules are those of
-            :attr:`~neuprim.core.task.TaskSpec.options`.
+        make: function (settings under ``train``, with the options of the loss as "options") -> the loss.
+        options: name -> (default, one line of help). Users set an option as ``task.options.NAME``. The rules of
+            :attr:`~neuprim.core.task.TaskSpec.options` apply.
         uses: the settings of :data:`neuprim.core.train.settings.OPTIONAL` under ``train`` that ``make`` reads.
     """
 

@@ -17,7 +17,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.model.fields import ConditionSpec
 
-MAX_LIGHT_ANGLE = 15.0  # degrees from every training light beyond which a direction counts as unseen
+MAX_LIGHT_ANGLE = 15.0  # a direction more than so many degrees from every training light counts as unseen
 _MAX_DIRECTIONS = 256  # of training lights in a model's header
 _ORBIT = (4.5, 40.0, 60)  # distance in scene units, polar angle in degrees, frames
 
@@ -62,8 +62,10 @@ def parse_light_positions(text: str, world: World | None = None) -> list[Tensor]
 
 
 def light_orbit_in_frames(text: str, count: int) -> str | None:
-    """Return the text of an orbit with ``count`` frames, ``"orbit:4:40:24"``; None unless ``text`` is an orbit without
-    a number of frames."""
+    """Return the text of the orbit ``text`` with ``count`` frames added, such as ``"orbit:4:40:24"``.
+
+    Return None if ``text`` is no orbit, or already states a number of frames.
+    """
     parts = text.split(":")
     if parts[0] != "orbit" or len(parts) > 3:
         return None
@@ -111,8 +113,11 @@ LIGHT_CONDITIONS = (
 
 
 def summarize_lights(lights: Tensor, center: Tensor, falloff: str, exposure: float) -> dict[str, Any]:
-    """Return JSON-able facts on the training lights ``lights`` (L, 3) for a model's header: their mean distance from
-    ``center``, at most 256 directions by farthest-point sampling, ``falloff`` and ``exposure``."""
+    """Return JSON-able facts on the training lights for a model's header.
+
+    The facts are the mean distance of the positions ``lights`` (L, 3) from ``center``, at most 256 directions of lights
+    (chosen by farthest-point sampling), ``falloff`` and ``exposure``.
+    """
     offsets = lights.double() - center.double()
     distance = offsets.norm(dim=-1)
     units = offsets / distance.clamp_min(1e-30)[:, None]
@@ -131,13 +136,17 @@ def summarize_lights(lights: Tensor, center: Tensor, falloff: str, exposure: flo
 
 
 def lights_from_environment(environment: Environment, count: int, facts: Mapping[str, Any]) -> Illumination:
-    """Approximate an environment by at most ``count`` point lights like the lights of the training views.
+    """Approximate an environment map by at most ``count`` point lights like the lights of the training views.
 
-    Each direction becomes a light at the training lights' mean distance r. Its intensity I gives the scene's centre the
-    environment's irradiance E. With falloff inverse_square, the model renders I / (distance^2 x exposure), so I =
-    exposure x E r^2. With falloff irradiance, I = exposure x E; else, I = exposure x E / pi. At an offset from the
-    centre, the light differs from parallel light by about 2 offset/r. A black environment gives one black light.
-    ``facts`` is the entry "data" of the model's header. Raises DataError if the entry is damaged.
+    The environment map is first reduced to ``count`` directions. Each direction becomes a point light at the mean
+    distance r of the training lights. The light's intensity I is chosen so that the scene's centre receives the
+    irradiance E of the direction. With falloff "inverse_square", the model renders I / (distance^2 x exposure), so I =
+    exposure x E r^2. With falloff "irradiance", I = exposure x E. With falloff "none", I = exposure x E / pi. At an
+    offset from the centre, the light differs from parallel light by about 2 offset/r. A black environment map gives one
+    black light.
+
+    ``facts`` is the entry "data" of the model's header, see :func:`summarize_lights`. Raises DataError if the entry is
+    damaged.
     """
     data = JsonReader(dict(facts), "the model's header: data")
     center, up = (data.array(name, (3,), "3 numbers") for name in ("center", "up"))

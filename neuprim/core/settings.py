@@ -21,26 +21,28 @@ class RenderSettings:
     Attributes:
         backend: "auto" (the fastest that can render the model), "reference" (float64 torch), "cpu" (numba) or another
             name that ``neuprim doctor`` lists.
-        device: where a run keeps the model, the state of the optimiser and its images: "cpu", "cuda" (refused without
+        device: where a run keeps the model, the state of the optimiser and the images: "cpu", "cuda" (refused without
             an NVIDIA GPU) or "auto" (a GPU if a backend can render the model there, else the CPU). Files do not depend
-            on it: a run begun on one device can continue on the other.
-        sort: order of compositing, front to back. "center": whole primitives by the camera-z of their centres, one
-            order for all pixels. "entry": in every pixel by the camera-z at which the ray enters, first the primitives
-            that the near plane cuts, equal ones by their centres; slower, but primitives do not pop when their centres
-            swap.
-        samples: rays per pixel side, on a regular grid in the pixel, averaged. 1 renders through pixel centres; n takes
-            n^2 times as long.
-        alpha_max: upper bound of the opacity of one primitive; at most 0.9999, as the backward pass divides by 1 -
+            on the device, so a run that started on one device can continue on the other.
+        sort: order of compositing, front to back. "center" sorts whole primitives by the camera-z of their centres, so
+            all pixels have the same order. "entry" sorts the primitives of each pixel by the camera-z at which the ray
+            enters the ellipsoid. Primitives cut by the near plane come first; ties are ordered by the centres.
+            "entry" is slower, but images do not change abruptly when two centres swap their order.
+        samples: number n of rays along each side of a pixel. The colours of n x n rays on a regular grid are averaged,
+            which takes n^2 times as long. 1 renders through pixel centres.
+        alpha_max: upper bound of the opacity of one primitive; at most 0.9999, because the backward pass divides by 1 -
             alpha.
-        alpha_min: pairs of a ray and a primitive with less opacity are skipped.
-        transmittance_min: a ray ends after the primitive that takes its transmittance below this.
-        near: camera-z of the near plane in scene units; primitives are cut there. For a ``RayCamera``, which has no
-            plane, a distance along the ray. "auto", the default of a run, is 1/400 of the median depth at which
-            training cameras see the starting points, and at most a tenth of the smallest depth; a training chooses and
-            records it. Without a training it follows from the primitives and each camera.
-        depth_floor: lower bound of D = 1 - |x_m|^2 in the backward pass only: gradients grow as D^-1/2 at a silhouette,
-            where float32 resolves D to about 3e-7. At 1e-4 they keep three digits, and one chord in ten thousand is
-            affected.
+        alpha_min: a primitive whose opacity along a ray is smaller than this is skipped for this ray.
+        transmittance_min: a ray ends after the primitive at which the ray's transmittance falls below this value.
+        near: camera-z of the near plane in scene units; the near plane cuts primitives. A ``RayCamera`` has no plane;
+            for this camera, ``near`` is a distance along the ray. "auto", the default of a run, is 1/400 of the median
+            depth at which training cameras see the starting points, and at most a tenth of the smallest depth. A
+            training chooses and records this distance. Without a training, the distance follows from the primitives and
+            each camera.
+        depth_floor: lower bound of D = 1 - |x_m|^2 in the backward pass only, where x_m is the middle of a ray's chord
+            through the ellipsoid, in units where the ellipsoid is the unit sphere. Gradients grow as D^-1/2 at a
+            silhouette, where float32 resolves D only to about 3e-7. With the bound 1e-4, gradients keep three digits,
+            and one chord in ten thousand is affected.
         depth: whether to render the depth image too.
         threads: threads of the cpu backend; 0 uses all cores. Results are bit-identical for any number.
     """
@@ -75,8 +77,8 @@ class MetricsSettings:
     """What a run measures on request; part of its configuration as ``metrics``.
 
     Attributes:
-        lpips: file or folder with weights for LPIPS (:class:`neuprim.core.metrics.lpips.Lpips`); null does not measure
-            it. neuprim has no weights and downloads none.
+        lpips: file or folder with weights for LPIPS (:class:`neuprim.core.metrics.lpips.Lpips`). null does not measure
+            LPIPS. neuprim contains no weights and downloads none.
     """
 
     lpips: Annotated[str, nonempty_text("a file or folder with the weights of LPIPS")] | None = None

@@ -29,9 +29,10 @@ class Supervision:
 
     Attributes:
         view: name, camera and conditions of the view.
-        mask: (H, W) bool of the pixels that count, None for all; where it is False, ``rendered`` equals ``truth``.
-        alpha: (H, W) coverage 0..1 of the true image before it was composited over the background of this step; None
-            for an opaque photograph.
+        mask: (H, W) bool of the pixels that count; None for all. Where the mask is False, the rendered image equals the
+            true image.
+        alpha: (H, W) opacity 0..1 of the true image before it was composited over the background of this step; None for
+            an opaque photograph.
         progress: used fraction of the training budget (steps or seconds), 0..1.
     """
 
@@ -42,16 +43,18 @@ class Supervision:
 
 
 Loss = Callable[[Tensor, Tensor, Supervision], tuple[Tensor, Mapping[str, float | Tensor]]]
-"""Function (rendered (H, W, C), truth (H, W, C), :class:`Supervision`) -> (scalar with gradient, named numbers for the
-log, floats or tensors with one number). An attribute ``recordable = True`` of the function says that it never waits for
-a GPU and does the same in every step (it does not read ``Supervision.progress``), so that steps may be CUDA graphs."""
+"""Function (rendered (H, W, C), truth (H, W, C), :class:`Supervision`) -> (scalar with gradient, numbers for the log by
+name, as floats or tensors with one number).
+
+An attribute ``recordable = True`` of the function allows the trainer to record training steps as CUDA graphs. Such a
+function must never wait for a GPU, and must do the same in every step. So it must not read ``Supervision.progress``."""
 
 Display = Callable[[Tensor], Tensor]
 """Function (H, W, C) colours in the data set's colour space -> (H, W, 3) sRGB values 0..1, pixel by pixel."""
 
 Illuminate = Callable[[Environment, int, Mapping[str, Any]], Illumination]
-"""Function (environment, number of lights that approximate it, :attr:`TaskSpec.facts` of the model) -> frames whose sum
-is the image."""
+"""Function (environment map, number of lights that approximate the map, :attr:`TaskSpec.facts` of the model) ->
+conditions of the frames whose images add up to the lit image."""
 
 
 @dataclass(frozen=True)
@@ -90,12 +93,13 @@ class SceneSpec:
     Attributes:
         name: what the user types after ``scene=``.
         summary: one line for ``neuprim tasks``.
-        load: (scene settings, context) -> Dataset; raises :class:`~neuprim.core.errors.DataError` for bad input.
-        volume: for scenes of voxel files: (scene settings, context) -> the files; renders nothing.
-        truth: for scenes that render their images frame by frame: (scene settings, context,
+        load: function (scene settings, context) -> Dataset; raises :class:`~neuprim.core.errors.DataError` for invalid
+            data. The context has the seed, a cache folder and a function that shows the progress.
+        volume: for scenes of voxel files: function (scene settings, context) -> the files, without rendering.
+        truth: for scenes that render their images frame by frame: function (scene settings, context,
             :attr:`~neuprim.core.data.dataset.DatasetImages.known` of another process or None) -> the images to render.
-        chunks: for scenes with a setting ``chunks``: (configuration of the run by the keys of the command line,
-            context) -> the chunks, or None if one run is better.
+        chunks: for scenes with a setting ``chunks``: function (configuration of the run by the keys of the command
+            line, context) -> the chunks, or None if one run is better.
     """
 
     name: str
@@ -114,43 +118,49 @@ class TaskSpec:
         api: the :data:`API_VERSION` that the task was written for.
         name: what the user types after ``task=``.
         config_package: importable package with ``task/NAME.yaml``, ``scene/NAME/*.yaml`` and ``preset/NAME/*.yaml``.
-        build: (model settings, dataset) -> the density field and the colour field. The model settings have the options
-            of the task as "options", and those settings in :data:`neuprim.core.train.settings.OPTIONAL` that ``uses``
-            lists.
-        loss: (settings under ``train``, options of the task as "options") -> the loss; ``train.loss`` may replace it.
-        check: (model settings, as for ``build``) raises :class:`~neuprim.core.errors.ConfigError` for settings that the
-            task does not have; called before any data is loaded.
+        build: function (model settings, dataset) -> the density field and the colour field. The model settings contain
+            the options of the task as "options". Of the settings in :data:`neuprim.core.train.settings.OPTIONAL`, they
+            contain only those that ``uses`` lists.
+        loss: function (settings under ``train``, with the options of the task as "options") -> the loss. The user can
+            choose another loss with ``train.loss``.
+        check: function (model settings, as for ``build``) that raises :class:`~neuprim.core.errors.ConfigError` for
+            settings that the task does not have; called before any data is loaded.
         conditions: the conditions that the fields depend on, such as the time.
         fields: class name -> field class, so that a saved model can be rebuilt from its header.
-        example: makes a tiny data set for :mod:`neuprim.conformance`, for tasks whose fields need more than posed
-            images and conditions within their ranges. Images of about 10 x 10 pixels are enough.
-        environment: how an environment map lights the scene (``neuprim render --environment``); None for tasks without
-            light. Images must be linear in the light, and their opacity independent of the light.
+        example: function () -> a tiny data set for the tests in :mod:`neuprim.conformance`. Only a task whose fields
+            need more than posed images and conditions within their ranges needs this function. Images of about 10 x 10
+            pixels are enough.
+        environment: function that converts an environment map to conditions, for ``neuprim render --environment``; None
+            for tasks without light. Images must be linear in the light, and their opacity must not depend on the light.
         channels: names of the channels of the task's images, e.g. ``("450nm", "550nm")``; data sets with another number
             of channels are refused. Empty: R, G, B for three channels, Y for one, else c0, c1, ...
-        display: (H, W, C) colours in the data set's colour space -> (H, W, 3) sRGB values 0..1, pixel by pixel. None:
-            three channels are shown as red, green and blue, one as grey; with other numbers, the first three are shown.
-        layers: what ``neuprim render --format exr`` can write besides the layers of every task.
+        display: function (H, W, C) colours in the data set's colour space -> (H, W, 3) sRGB values 0..1, pixel by
+            pixel. Without this function, channels named R, G and B are shown as red, green and blue. Without these
+            names, the first three channels are shown as red, green and blue, and a single channel as grey.
+        layers: additional image layers that ``neuprim render --format exr`` can write for this task.
         options: name -> (default, one line of help) of the task's own settings under ``task.options``. Values are
             converted to the default's type, or to a third entry: ``Annotated[float, Range(0, 1)]``,
             ``("soft", "hard")`` (:mod:`neuprim.core.validation`). ``task/NAME.yaml`` may have other defaults.
         uses: the shared settings of :data:`neuprim.core.train.settings.OPTIONAL` that ``build`` (``model.…``) and
-            ``loss`` (``train.…``) read. A user who sets any other of them gets an error.
-        mask: (data set, index of a test view) -> (H, W) bool, the part of the view whose error is also reported
-            separately, or None.
-        metrics: (data set, index of a test view, rendered (H, W, C), truth (H, W, C)) -> further metrics by name, for
-            each view and as means in ``metrics.json``. Images are in the data set's colour space over its background.
-            ``mse_NAME`` becomes ``psnr_pooled_NAME``, the PSNR of its mean over views, weighted by ``pixels_NAME``;
-            ``pixels_NAME`` becomes a sum; every other metric becomes a plain mean over the views that have it.
-        diagnose: (data set, model) -> further JSON-able numbers for ``metrics.json``, such as errors against the
-            ground truth of a volume.
+            ``loss`` (``train.…``) read. If a user sets any other of these shared settings, this is an error.
+        mask: function (data set, index of a test view) -> (H, W) bool, the part of the view whose error is also
+            reported separately, or None.
+        metrics: function (data set, index of a test view, rendered (H, W, C), truth (H, W, C)) -> further metrics by
+            name. ``metrics.json`` states them for each view and as means over the views. Images are in the data set's
+            colour space, composited over the data set's background. Metrics ``mse_NAME`` give ``psnr_pooled_NAME``: the
+            PSNR of the mean of ``mse_NAME`` over views, weighted by ``pixels_NAME``. Metrics ``pixels_NAME`` are summed
+            over the views. Every other metric gives a plain mean over the views that have this metric.
+        diagnose: function (data set, model) -> further JSON-able numbers for ``metrics.json``, such as errors against
+            the ground truth of a volume.
         clips: films to make of test views or of other views of the data set.
         facts: JSON-able values that rendering needs without the data; stored in the model's header under "data",
             with "up" and "center".
-        orbit: (data set, number of frames) -> views circling the scene, with every condition of the task.
-        tunable_settings: (model settings, as for ``build``) -> settings that trade quality for speed or size, with the
-            values to try: ``{"model.neurons": (0, 2, 4, 8)}``. ``neuprim tradeoff task=NAME`` varies these settings,
-            the number of primitives and the length of training. Names begin with ``model.`` or ``task.options.``.
+        orbit: function (data set, number of frames) -> views on a circle around the scene, with every condition of the
+            task.
+        tunable_settings: function (model settings, as for ``build``) -> settings that trade quality for speed or size,
+            with the values to try: ``{"model.neurons": (0, 2, 4, 8)}``. ``neuprim tradeoff task=NAME`` varies these
+            settings, the number of primitives and the length of training. Names begin with ``model.`` or
+            ``task.options.``.
     """
 
     api: int

@@ -9,8 +9,8 @@
     # ConfigError: model.density.cuont: no such setting; did you mean 'model.density.count'?
 
 Types are ``bool``, ``int``, ``float``, ``str``, ``Path``, ``list``, ``Literal``, ``tuple``, ``dict``, other settings
-dataclasses, unions of these, and ``Any``. Conversions lose nothing: 1e5 is a whole number, true is not one, and no
-number is NaN or infinite.
+dataclasses, unions of these, and ``Any``. Conversions lose nothing: 1e5 is accepted as a whole number, true is not.
+Numbers that are NaN or infinite are refused.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ __all__ = ["Accepts", "Option", "Range", "Unbounded", "validate_choices", "valid
 T = TypeVar("T")
 
 Option = tuple[Any, str] | tuple[Any, str, Any]
-"""An option of a task or loss: its default, one line of help, and optionally its type with bounds or choices, as on a
-settings dataclass. Without a type, values are converted to the type of the default."""
+"""An option of a task or loss: (default, one line of help), or (default, one line of help, type). The type may have
+bounds or choices, as the annotation of a field in a settings dataclass. Without a type, values are converted to the
+type of the default."""
 
 _KINDS = {
     bool: "true or false",
@@ -148,10 +149,10 @@ def validate_settings(cls: type[T], values: object, where: str = "") -> T:
 
 
 def validate_choices(found: Mapping[str, Any], where: str, offered: Mapping[str, Any]) -> None:
-    """Raise ConfigError for a setting that is not in ``offered``, or whose value is not of the type given there.
+    """Raise ConfigError if a setting is not in ``offered``, or if its value does not have the type in ``offered``.
 
     Args:
-        found: setting name -> value, as user and preset set them.
+        found: setting name -> value from the user or a preset.
         where: dotted name of the group, for messages.
         offered: setting name -> annotated type, as on a settings dataclass, or a tuple of the allowed values.
     """
@@ -251,7 +252,10 @@ def _setting_reads_as_number(value: str) -> bool:
 
 
 def describe_expected(hint: Any, where: str) -> str:
-    """Return what a type accepts, for messages: ``"a whole number from 1 to 16"``; ``where`` is the setting's key."""
+    """Return a text for messages that says what a type accepts, such as ``"a whole number from 1 to 16"``.
+
+    ``where`` is the dotted key of the setting.
+    """
     plain, notes = _split_validation_type(hint)
     says = next((note.says for note in notes if isinstance(note, Accepts)), "")
     if says:
@@ -314,7 +318,10 @@ def _validate_union_value(value: Any, options: tuple[Any, ...], where: str) -> A
 
 
 def _validate_plain_value(value: Any, kind: Any, notes: tuple[Any, ...], where: str) -> Any:
-    """Return ``value`` as the plain type ``kind``; ``notes``, the type's annotations, serve only the error message."""
+    """Return ``value`` as the plain type ``kind``.
+
+    ``notes`` are the annotations of the type; only the error message uses them.
+    """
     origin, args = get_origin(kind), get_args(kind)
     if kind is Any:
         return value

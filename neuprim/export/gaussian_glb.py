@@ -8,8 +8,8 @@ The file has one primitive of mode POINTS with these attributes, all float32 (K 
 * ``COLOR_0``: colour of degree 0 and opacity, for viewers that show only points
 
 Coordinates are those of the run's data, rotated from z up to glTF's y up, unless the data have y up. The colour space
-is ``lin_rec709_display`` for models of linear images, else ``srgb_rec709_display``. The Gaussians and their error are
-those of :mod:`neuprim.export.gaussian_ply`.
+is ``lin_rec709_display`` for models of linear images, else ``srgb_rec709_display``. The Gaussians are fitted, and their
+error is measured, as in :mod:`neuprim.export.gaussian_ply`.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def _write_gaussian_glb(job: ExportJob) -> ExportReport:
 def _gaussian_attributes(fitted: ExportedGaussians, matrix: torch.Tensor) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return name -> (M, k) float32 attribute, and the (3,) offset to add to the positions.
 
-    ``matrix`` (4, 4) float64 maps scene coordinates to the file's.
+    ``matrix`` (4, 4) float64 maps scene coordinates to the coordinates of the file.
     """
     means, scales, quats, opacity, harmonics = fitted.placed(World(matrix))
     offset, opacity = matrix[:3, 3].numpy(), opacity[:, None]

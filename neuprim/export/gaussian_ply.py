@@ -5,15 +5,16 @@ The vertices are binary, little-endian, and consist of floats:
 * ``x y z``: centre in the coordinates of the run's data; ``double`` where float32 would lose more than 1e-4 of the
   scene's size, as in UTM coordinates
 * ``nx ny nz``: 0
-* ``f_dc_0..2 f_rest_0..44``: SH coefficients of degree 3; ``f_rest`` has 15 of red, 15 of green, 15 of blue
+* ``f_dc_0..2 f_rest_0..44``: SH coefficients of degree 3; ``f_rest`` has 15 for red, then 15 for green, 15 for blue
 * ``opacity``: logit of the opacity
 * ``scale_0..2``: natural logarithm of the standard deviations
 * ``rot_0..3``: quaternion wxyz
 
 :func:`fit_gaussians` fits the Gaussians. Colours stay in the model's colour space, but viewers show them as sRGB. A
-grey model is written as three equal channels. Models with channels other than red, green and blue are refused. A model
-that depends on time or light is exported for one time and light (``--time 0.5``, ``--light 1,2,3 --light-intensity
-10,10,10``), or as one file per frame. Colours that are no spherical harmonics are approximated by spherical harmonics.
+grey model is written as three equal channels. Models with channels other than red, green and blue are refused. If a
+model depends on time or light, one file holds one time and light (``--time 0.5``, ``--light 1,2,3 --light-intensity
+10,10,10``), and several frames become several files. Colours that are no spherical harmonics are approximated by
+spherical harmonics.
 
 The reported error is a PSNR: images of the Gaussians, drawn as the 3DGS rasteriser does, against the model's images.
 """
@@ -87,8 +88,8 @@ class ExportedGaussians:
     def placed(self, world: World) -> tuple[np.ndarray, ...]:
         """Return the Gaussians in the coordinates that ``world`` maps the scene to, as float64 arrays.
 
-        They are centres (M, 3), standard deviations (M, 3), quaternions wxyz (M, 4), opacities (M,) and SH coefficients
-        of degrees 0 to 3 (M, 16, 3).
+        The arrays are centres (M, 3), standard deviations (M, 3), quaternions wxyz (M, 4), opacities (M,) and SH
+        coefficients of degrees 0 to 3 (M, 16, 3).
         """
         gaussians, colours = self.gaussians.to_scene(world), self.colours.rotate(world.rotation)
         harmonics = torch.cat([colours.dc[:, None], colours.rest], 1)[gaussians.rows]
@@ -96,7 +97,7 @@ class ExportedGaussians:
 
 
 def fit_exported_gaussians(job: ExportJob) -> ExportedGaussians:
-    """Fit Gaussians to a model, of the size that :data:`OPTIONS` choose; raise ConfigError if nothing absorbs light."""
+    """Fit Gaussians to a model by the method of the option ``size``; raise ConfigError if nothing absorbs light."""
     size, which = job.choice("size", "auto", *SIZES), job.choice("views", "auto", "test", "orbit")
     (conditions,) = job.frames()
     channels, rgb = job.run.channels, find_export_rgb_channels(job.run)
@@ -149,7 +150,7 @@ def _write_gaussian_ply(job: ExportJob) -> ExportReport:
 
 
 def _gaussian_ply_rows(fitted: ExportedGaussians, world: World) -> np.ndarray:
-    """Return Gaussians as PLY vertices in the user's coordinates. Centres are double if float32 is too coarse."""
+    """Return Gaussians as PLY vertices in the run's data coordinates. Centres are double if float32 is too coarse."""
     means, scales, quats, opacity, harmonics = fitted.placed(world.inverse)
     rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(-1, 45)
     logit = np.log(opacity) - np.log1p(-opacity)
@@ -207,7 +208,7 @@ class Gaussians:
         means: (M, 3), scene units.
         covariances: (M, 3, 3), squared scene units.
         opacities: (M,) alpha at the centre of the projected Gaussian, 0..1.
-        rows: (M,) for each Gaussian, the index of its primitive among the active ones.
+        rows: (M,) for each Gaussian, the index of its primitive among the active primitives.
     """
 
     means: Tensor
@@ -239,8 +240,8 @@ def fit_gaussians(run: TrainedModel, conditions: Conditions, size: str) -> Gauss
       Its opacity is 1 - exp(-tau), averaged over the three axes of the ellipsoid. tau is the integral of rho along a
       line through the mean, parallel to the axis.
     * "footprint": As "moments", but the covariance is scaled. The Gaussian's projected alpha is opacity x exp(-d^2/2)
-      at d standard deviations. On average over views along the three axes, its integral over the image equals that of
-      the primitive's alpha.
+      at d standard deviations. On average over views along the three axes, the integral of this alpha over the image
+      equals the integral of the primitive's alpha.
     * "profile": The scale of the covariance and the opacity minimise the squared difference of the two alphas over the
       images along the three axes. For each scale, the opacity preserves the integral of alpha, but is at most 0.99.
 
@@ -347,7 +348,7 @@ def draw_exported_gaussians(
     standard deviations from the centre, alpha is min(0.99, opacity exp(-d^2/2)); Gaussians with alpha below 1/255 are
     skipped. Compositing is front to back by the depth of centres, and stops before the transmittance falls below 1e-4.
     Gaussians with a depth below 0.2 are left out. 3DGS draws a Gaussian only in the tiles within three standard
-    deviations; here, only alpha limits it.
+    deviations; this function limits its extent only by alpha.
     """
     view = camera.viewmat.double()
     W, t = view[:3, :3], gaussians.means @ view[:3, :3].T + view[:3, 3]

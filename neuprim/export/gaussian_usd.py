@@ -1,9 +1,9 @@
 """Export format ``gaussian-usd``: one Gaussian per primitive as USD's ParticleField3DGaussianSplat; lossy.
 
 Several frames become time samples of one prim, at the frame numbers of the model's source. Coordinates are those of the
-run's data; the stage states the upward axis. A prim's translation keeps large coordinates exact, as positions are
-float32. Opacities are 0 to 1, and SH coefficients of degree 3 have the conventions of 3D Gaussian splatting. The
-Gaussians and their error are those of :mod:`neuprim.export.gaussian_ply`.
+run's data; the stage states the upward axis. Positions are float32, so the prim's translation holds the offset of large
+coordinates. Opacities are 0 to 1, and SH coefficients of degree 3 have the conventions of 3D Gaussian splatting. The
+Gaussians are fitted, and their error is measured, as in :mod:`neuprim.export.gaussian_ply`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """Export format ``html``: one web page that draws the model with WebGL2; lossy unless ``level`` is 0.
 
-The page works in any browser with WebGL2 and needs no network and no server. It draws every primitive over its exact
-silhouette and integrates the density along rays in closed form, in float32. Primitives are composited front to back in
-the order of their centres. The image is that of ``renderer.sort=center`` with one ray per pixel and
-``transmittance_min`` at 0. ``level`` 1 to 5 compresses the model as ``neuprim compress`` does; 0 preserves every bit.
+The page works in any browser with WebGL2 and needs no network and no server. The page draws every primitive over its
+exact silhouette and integrates the density along rays in closed form, in float32. Primitives are composited front to
+back in the order of their centres. The image is the one that neuprim renders with ``renderer.sort=center``,
+``renderer.transmittance_min=0`` and one ray per pixel. ``level`` 1 to 5 compresses the model as ``neuprim compress``
+does; 0 preserves every bit.
 
 The reported error is a PSNR: images of the compressed model against images of the run's model. The run's backend draws
 both, on the page's views. The page can offer held-out views only if the scene's data can be read.

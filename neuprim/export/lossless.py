@@ -1,9 +1,9 @@
 """Export formats ``npz`` and ``ply``: every parameter of the model, bit for bit. ``neuprim import`` reads both.
 
-Both formats contain a JSON header. It has three parts: the model's header (task, field classes and their settings,
-background, colour space), the shapes of the parameters, and the text of the run's ``config.yaml``, which includes paths
-to the data. If the parameters are not in the coordinates of the run's data, "world" in the model's header has
-``scene_from_world``.
+Both formats contain a JSON header with three parts: the model's header, the shapes of the parameters, and the text of
+the run's ``config.yaml``. The model's header has the task, the field classes and their settings, the background and the
+colour space. ``config.yaml`` includes paths to the data. If the parameters are not in the coordinates of the run's
+data, "world" in the model's header has ``scene_from_world``.
 
 ``npz``: ``numpy.load(FILE, allow_pickle=False)`` gives one float32 array (N, ...) per parameter under the parameter's
 name, and the text ``header``.
@@ -11,8 +11,8 @@ name, and the text ``header``.
 ``ply``: binary little-endian, one vertex per primitive. The first properties are ``x y z``, the centre in the
 coordinates of the run's data, ``double`` where these differ from the model's coordinates. Then come all parameters as
 stored, ``float``, in the model's coordinates: logarithms of semi-axes, unnormalised quaternions wxyz, SH coefficients.
-Their names are PARAMETER_INDEX, and the index counts row by row: ``means_0`` to ``means_2``, ``W1_0`` to ``W1_23``. The
-header is one line ``comment neuprim {...}``.
+These properties are named PARAMETER_INDEX, and the index counts row by row: ``means_0`` to ``means_2``, ``W1_0`` to
+``W1_23``. The header is one line ``comment neuprim {...}``.
 """
 
 from __future__ import annotations
@@ -60,10 +60,10 @@ def _unpack_export_header(text: str, path: Path) -> tuple[dict[str, Any], dict[s
         raise DataError(f"{path}: the neuprim header is not valid JSON ({error})") from error
     if not isinstance(record, dict) or record.get("format") != _FORMAT:
         found = record.get("format") if isinstance(record, dict) else type(record).__name__
-        raise DataError(f"{path}: the neuprim header has format {found!r}; this neuprim reads {_FORMAT}")
+        raise DataError(f"{path}: the neuprim header has format {found!r}, but this neuprim reads {_FORMAT}")
     header, shapes, config = record.get("model"), record.get("parameters"), record.get("config")
     if not isinstance(header, dict) or not isinstance(shapes, dict) or not isinstance(config, str):
-        raise DataError(f"{path}: the neuprim header lacks model, parameters or config")
+        raise DataError(f"{path}: the neuprim header lacks model, parameters or config; expected all three")
     for name, shape in shapes.items():
         valid = isinstance(shape, list) and len(shape) <= 4 and all(type(n) is int and 0 <= n <= 10_000 for n in shape)
         if not valid or math.prod(shape) > 10_000:
@@ -96,7 +96,7 @@ def _read_npz_export(path: Path) -> StoredModel:
             tensors = {}
             for name, shape in shapes.items():
                 if (entry := entries.get(f"{name}.npy")) is None:
-                    raise DataError(f"{path}: no array {name!r}, which the header names")
+                    raise DataError(f"{path}: no array {name!r}; expected this array, because the header names it")
                 # arrays are stored uncompressed, so none is larger than the file
                 value = _read_npz_export_array(archive, entry, path, path.stat().st_size)
                 if value.dtype != np.float32 or value.ndim != len(shape) + 1 or value.shape[1:] != shape:
@@ -106,7 +106,7 @@ def _read_npz_export(path: Path) -> StoredModel:
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
         raise DataError(f"{path}: not a readable .npz ({' '.join(str(error).split())[:120]})") from error
     if len({len(value) for value in tensors.values()}) > 1:
-        raise DataError(f"{path}: arrays have different numbers of primitives")
+        raise DataError(f"{path}: arrays have different numbers of primitives; expected the same number in all")
     return StoredModel(header, tensors, config)
 
 
@@ -120,7 +120,7 @@ def _read_npz_export_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, pat
         shape, _, dtype = read(file)
         if dtype.hasobject or math.prod(shape) * dtype.itemsize > entry.file_size:
             claim = f"{entry.filename} claims {dtype} of shape {shape}"
-            raise DataError(f"{path}: {claim}; the entry has {entry.file_size} bytes")
+            raise DataError(f"{path}: {claim}; expected numbers that fit its {entry.file_size} bytes")
     with archive.open(entry) as file:
         return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
 
@@ -155,7 +155,7 @@ def _read_ply_export(path: Path) -> StoredModel:
         columns = [f"{name}_{i}" for i in range(math.prod(shape))]
         for column in columns:
             if column not in found.names or found.rows.dtype[column].str[1:] != "f4":
-                expected = f"the header has {name} of shape {shape}"
+                expected = f"expected float, because the header has {name} of shape {shape}"
                 raise DataError(f"{path}: property {column} is missing or not float; {expected}")
         flat = np.stack([found.rows[c] for c in columns], -1) if columns else np.zeros((len(found.rows), 0), np.float32)
         tensors[name] = np.ascontiguousarray(flat.reshape(len(found.rows), *shape), np.float32)

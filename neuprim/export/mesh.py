@@ -1,9 +1,9 @@
 """Export format ``mesh``: an isosurface of the density with vertex colours, as .glb, .ply or .obj; lossy.
 
-The density is sampled on a grid of ``grid`` voxels along the longest side. It is blurred by ``smooth`` voxels, because
-the hard edges of primitives would leave stairs. VTK's flying edges (Schroeder et al. 2015) extract the isosurface. The
-default level is that of :func:`find_export_surface_level`. Connected components whose area is less than ``keep`` times
-the largest one's are left out.
+The density is sampled on a grid of ``grid`` voxels along the longest side. The grid is blurred by ``smooth`` voxels, as
+the hard edges of primitives would leave stairs. VTK's flying edges (Schroeder et al. 2015) extract the isosurface. By
+default, :func:`find_export_surface_level` chooses the level. Connected components are left out if their area is less
+than ``keep`` times the area of the largest component.
 
 A vertex has the mean colour of the primitives around it, weighted by their density, seen from outside along its normal.
 The colours are what the task's display shows, or red, green and blue, or grey. Other channels are refused. Colours are
@@ -162,7 +162,7 @@ def find_export_surface_level(sigma: np.ndarray, step: float) -> float:
 
 
 def _drop_small_pieces(mesh: Any, keep: float) -> tuple[Any, int]:
-    """Remove connected components with less area than ``keep`` times the largest; return mesh and number removed."""
+    """Remove components with less than ``keep`` times the largest component's area; return mesh and number removed."""
     import trimesh
 
     if keep <= 0:
@@ -183,7 +183,7 @@ def _exported_vertex_colours(
     """Return (V, C) colours of mesh vertices at ``points`` (V, 3), seen from outside along ``normals`` (V, 3).
 
     A vertex has the mean colour of the primitives that contain it, weighted by their densities there. Outside all
-    primitives, it has the colour of the primitive with the nearest centre. ``colours`` are those of the primitives.
+    primitives, it has the colour of the primitive with the nearest centre. ``colours`` has the primitives' colours.
     """
     with torch.no_grad():
         active = job.run.model.active(conditions)

@@ -32,13 +32,14 @@ def write_usd_volume(
     up: Tensor,
     rate: float | None,
 ) -> None:
-    """Write the text file ``path`` (.usda), atomically. It refers to files in its folder by relative paths.
+    """Write the stage as text file ``path`` (.usda), atomically. The stage names files in its folder by relative paths.
 
     Args:
         files: frame number -> .vdb file, in the folder of ``path``. With one file, the volume does not change in time.
         grids: names of the grids in every file.
         boxes: (2, 3) bounds of the frames that have any voxel, in the files' world coordinates.
-        up: (3,) upward direction in these coordinates. USD knows y and z only; the larger of the two is written.
+        up: (3,) upward direction in these coordinates. USD only allows y and z as upward axis;
+            the axis with the larger component is written.
         rate: frames per second; None leaves USD's default, 24.
     """
     head = ['defaultPrim = "volume"', f'upAxis = "{"Y" if y_is_up(up) else "Z"}"']

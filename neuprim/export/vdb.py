@@ -4,9 +4,9 @@ Grid ``density`` is the sum of the primitives' densities at the voxels' centres,
 below ``threshold`` are not stored (background 0, inactive).
 
 A model that was fitted to .vdb files is written on the voxels and in the units of these source files. Values are
-limited to the largest value of the source frame and to the box of its active voxels. If flames add to the extinction,
-only the part of the source's extinction grid is written. Other models are written in the coordinates of the run's data,
-on cubic voxels with index (0, 0, 0) at the scene's origin.
+limited to the largest value of the source frame and to the box of its active voxels. If flames add to the model's
+extinction, only the part that comes from the source's extinction grid is written. Other models are written in the
+coordinates of the run's data, on cubic voxels with index (0, 0, 0) at the scene's origin.
 
 Units (metadata ``neuprim_units``):
 
@@ -222,8 +222,8 @@ def _find_export_source(
 def _list_export_frames(job: ExportJob, placement: DensityGridPlacement | None) -> list[_GridFrame]:
     """List the frames to write: the frames that the user names, else all frames of the model's source .vdb files.
 
-    If all of them are at the times of different frame numbers of the source, they have these numbers, else they count
-    from 0. A model without conditions, such as the time, has one frame.
+    If the times of the frames match different frame numbers of the source, the frames get these numbers. Otherwise,
+    frames are numbered from 0. A model without conditions, such as the time, has one frame.
     """
     if not job.run.task.conditions:
         return [_GridFrame(0, {})]
@@ -305,7 +305,7 @@ class _VdbExportSampler(NamedTuple):
         """Sample one frame as a sparse grid. Only one block at a time is dense in memory.
 
         Args:
-            transform: (4, 4) index to world.
+            transform: (4, 4) matrix from voxel indices to world coordinates.
 
         Raises:
             ConfigError: the model's bounding box has too many voxels.
@@ -340,7 +340,8 @@ class _VdbExportSampler(NamedTuple):
     ) -> Iterator[VdbGrid]:
         """Yield one sparse grid per block of voxels. A dense block fits into about 64 MiB.
 
-        Their x and y sides are multiples of 8 voxels. All blocks together start at index ``first`` and have ``size``.
+        Sides of blocks along x and y are multiples of 8 voxels. All blocks together start at index ``first`` and have
+        ``size``.
         """
         settings = self.job.run.settings
         rows = max(8, min(int(size[1]), _SLAB_BYTES // (32 * int(size[2])) & ~7))

@@ -133,10 +133,10 @@ class LookExport:
 def choose_look(
     job: ExportJob, conditions: Conditions, per_world: float, scene_from_world: np.ndarray
 ) -> LookExport | None:
-    """Return the sampler of the grids that the options ``emission`` and ``albedo`` ask for; None for neither.
+    """Return the sampler of the grids that the options ``emission`` and ``albedo`` request; None if no option is set.
 
     Raises:
-        ConfigError: the colours of the model do not contain what is asked for.
+        ConfigError: the colours of the model do not contain emission, or do not contain albedo.
         DataError: the model's header has an impossible exposure.
     """
     names = tuple(name for name in ("emission", "albedo") if job.flag(name))
@@ -206,7 +206,7 @@ def choose_velocity(
     rate = job.number("fps", 0.1, 240.0)
     if not job.flag("velocity"):
         if rate is not None and not job.flag("usd"):
-            raise ConfigError("fps: found without velocity and usd; expected one of them. Pass velocity=true.")
+            raise ConfigError("fps: used only with velocity=true or usd=true; pass one of them, or leave out fps")
         return None
     active = model.active(frames[0])
     if "time" not in frames[0] or active.geometry is active.stored:
@@ -216,10 +216,8 @@ def choose_velocity(
         )
     interval = frame_interval(job.run.header, (float(conditions["time"]) for conditions in frames))
     if interval is None:
-        found = "one frame, and the model has no numbered frames"
-        raise ConfigError(
-            f"velocity=true: {found}; expected an interval between frames. Pass a range, as --time 0:1:48."
-        )
+        found = "the frame interval is unknown: one frame, and the model has no numbered frames"
+        raise ConfigError(f"velocity=true: {found}; expected several frames. Pass a range, such as --time 0:1:48.")
     unit = "world units per frame" if rate is None else "world units per second"
     return VelocityExport(interval * (rate or 1.0), unit, scene_from_world, job.run.settings.threads)
 

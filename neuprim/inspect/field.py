@@ -36,7 +36,7 @@ class InspectionFrame:
     """One frame of a model for inspectors, with the model's extinction on a grid, computed at first use.
 
     Attributes:
-        scene_from_index: (4, 4) transform from grid index to scene; the axes are parallel to the scene's.
+        scene_from_index: (4, 4) transform from grid index to scene; the grid's axes are parallel to the scene's axes.
         top: upper end of the colour scale of the extinction, 1/scene unit; the same for all frames.
         gain: factor on the optical depth of :class:`~neuprim.inspect.layers.Volume`; the same for all frames.
         focus: (3,) centre of the extinction of all frames, scene units.
@@ -65,7 +65,7 @@ class InspectionFrame:
     _grids: dict[str, np.ndarray] = field(default_factory=dict)  # shared by the panels of a frame
 
     def of_side(self, side: str) -> InspectionFrame:
-        """Return this frame with :attr:`side` "model" or "truth"; both share the computed grids."""
+        """Return a copy with :attr:`side` "model" or "truth". The copy shares the grids that are already computed."""
         return replace(self, side=side)
 
     @property
@@ -93,7 +93,8 @@ class InspectionFrame:
     def sigma(self) -> np.ndarray:
         """Extinction at the grid points, (X, Y, Z) float32, 1/scene unit.
 
-        If :attr:`side` is "model": the sum over primitives, each clamped at 0 from below. If "truth": the ground truth.
+        If :attr:`side` is "truth", this is the ground truth. If it is "model", this is the sum of the primitives'
+        extinctions, each clamped at 0 from below.
         """
         if self.side not in self._grids:
             if self.side == "model":
@@ -128,7 +129,7 @@ class InspectionFrame:
 
     @cached_property
     def masses(self) -> np.ndarray:
-        """Integral of the extinction over the volume of each of M active primitives; see :func:`measure_absorption`."""
+        """Integral of the extinction over each active primitive's volume, (M,); see :func:`measure_absorption`."""
         return measure_absorption(self.active)
 
     @cached_property
@@ -143,7 +144,7 @@ class InspectionFrame:
         return np.asarray(self.channels.display_rows(rgb.float().clamp_min(0)).numpy())
 
     def chosen_position(self) -> int:
-        """Return the index in :attr:`rows` of the primitive to show alone.
+        """Return the position, in :attr:`rows`, of the primitive to show alone.
 
         Raises:
             ConfigError: :attr:`primitive` does not exist or is not active in this frame.
@@ -162,7 +163,8 @@ class InspectionFrame:
 def measure_absorption(active: ActivePrimitives) -> np.ndarray:
     """Estimate the integral of max(0, sigma) over each active primitive, (M,) float64.
 
-    sigma is the extinction. The estimate is its mean at 33 points of the ellipsoid times the ellipsoid's volume.
+    sigma is the extinction. The estimate is the mean of max(0, sigma) at 33 points of the ellipsoid, times the
+    ellipsoid's volume.
     """
     i = torch.arange(33)
     radius, height, angle = ((i + 0.5) / 33) ** (1 / 3), 1 - 2 * ((i * 0.618034 * 7 + 0.5) % 1), i * 2.399963
@@ -182,7 +184,7 @@ def measure_absorption(active: ActivePrimitives) -> np.ndarray:
 
 
 class GivenConditions(dict[str, Tensor]):
-    """Conditions of a frame, as a dict. A missing condition raises a ConfigError that asks the user for it."""
+    """Conditions of a frame, as a dict. Reading a missing condition raises a ConfigError that names its option."""
 
     def __missing__(self, name: str) -> Tensor:
         raise ConfigError(f"the condition {name} is missing; give {condition_flag(name)}")
@@ -194,7 +196,8 @@ def read_inspected_conditions(
     """Read the conditions of each frame with :func:`~neuprim.core.conditions.read_conditions`.
 
     ``texts`` maps a condition's name to the user's text. A scalar condition without text gets the middle of its range.
-    Other conditions without text are left out. If two conditions are animated, the shorter animation is stretched.
+    Other conditions without text are left out. If several conditions are animated, the shorter animations are
+    stretched to the number of frames of the longest.
     """
     given = read_conditions(specs, texts, warn)
     found: dict[str, list[Tensor]] = {}
@@ -228,7 +231,7 @@ def parse_inspection_box(numbers: Sequence[float]) -> np.ndarray:
 
 
 def find_inspection_box(model: Primitives, frames: Sequence[Conditions]) -> np.ndarray:
-    """Return a (2, 3) float64 box with nearly all of the model's extinction, measured in up to nine of ``frames``.
+    """Return a (2, 3) float64 box that contains nearly all of the model's extinction in up to nine of ``frames``.
 
     Raises:
         DataError: the model absorbs nothing.
@@ -259,7 +262,7 @@ def _inspection_box_quantile(values: np.ndarray, weights: np.ndarray, part: floa
 
 
 def open_inspection_truth(path: str, volume: Callable[[], DensityGridSource | None]) -> tuple[DensityTruth, str]:
-    """Open the ground-truth density of ``--against``; return the density and a one-line description.
+    """Open the ground-truth density that ``--against`` names; return the density and a one-line description.
 
     Args:
         path: an OpenVDB file, a folder of OpenVDB files, or "scene" for the files of the run's scene.
@@ -283,8 +286,8 @@ def open_inspection_truth(path: str, volume: Callable[[], DensityGridSource | No
 def pair_inspected_frames(frames: Sequence[Conditions], truth: DensityTruth) -> list[tuple[Conditions, int]]:
     """Pair each frame of the model, given by its conditions, with the ground-truth frame of the nearest conditions.
 
-    Return pairs (conditions, index of the ground-truth frame) without duplicates. The conditions of a pair are those
-    of its ground-truth frame.
+    Return pairs (conditions, index of the ground-truth frame); each ground-truth frame occurs once at most. The
+    conditions of a pair have the values of the ground-truth frame, as far as that frame has them.
     """
     pairs: dict[int, Conditions] = {}
     for conditions in frames:

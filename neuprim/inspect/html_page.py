@@ -1,6 +1,6 @@
-"""Write the inspection layers of all frames as one HTML file, for browsers with WebGL 2; it needs no network.
+"""Write the inspection layers of all frames as one HTML file, for browsers with WebGL 2; the page needs no network.
 
-Grids are stored with 8 bits per value. Arrays are compressed. Layers share the arrays they have in common.
+Grids are stored with 8 bits per value. Arrays are compressed. A grid that several layers use is stored once.
 """
 
 from __future__ import annotations
@@ -49,7 +49,9 @@ def write_inspection_page(
     frame: Callable[[int], InspectionFrame],
     inspectors: Sequence[Inspector],
 ) -> None:
-    """Write an HTML page of ``count`` frames. It opens with the first of ``inspectors`` and also has built-in ones.
+    """Write an HTML page of ``count`` frames, with the layers of ``inspectors`` and of some built-in inspectors.
+
+    The page opens with the first of ``inspectors``.
 
     Args:
         name: name of the run.
@@ -57,7 +59,7 @@ def write_inspection_page(
         frame: function that returns the frame with a given index; all frames have the same grid.
 
     Raises:
-        ConfigError: one page cannot hold so many frames.
+        ConfigError: the page would be too large; the message says after how many frames.
     """
     first = frame(0)
     free = [view for view in _ALWAYS if view.shows != "both" or first.truth is not None]
@@ -107,7 +109,7 @@ def _inspection_frame_data(frame: InspectionFrame, views: Sequence[Inspector], u
 
 
 def encode_inspected_values(values: np.ndarray, scale: Scale) -> tuple[np.ndarray, str]:
-    """Encode values as uint8; return the bytes and the name of the code, which depends on the ends of the scale.
+    """Encode values as uint8; return the bytes and the name of the code. The ends of the scale decide the code.
 
     ========  ==========================  ==================================================
     code      scale                       byte
@@ -140,7 +142,7 @@ class InspectionFrameArrays:
         self._grids: dict[tuple[int, float, float], tuple[np.ndarray, int, str]] = {}
 
     def pack_layers(self, layers: Sequence[Layer]) -> list[dict[str, Any]]:
-        """Convert valid layers to JSON values; store each array in :attr:`arrays` and replace it by its index there."""
+        """Convert valid layers to JSON values. Arrays are stored in :attr:`arrays`; the JSON has their indices."""
         return [self._pack(layer) for layer in layers]
 
     def _pack(self, layer: Layer) -> dict[str, Any]:

@@ -57,7 +57,7 @@ class InspectionGrid:
 
 @dataclass(frozen=True, eq=False)
 class Volume(InspectionGrid):
-    """A volume rendering of a grid; the opacity of a segment of length h (scene units) is 1 - exp(-|value| depth h)."""
+    """A volume rendering of a grid. A ray segment of length h (scene units) has opacity 1 - exp(-|value| depth h)."""
 
     depth: float = 1.0  # optical depth of the value 1 per scene unit; frame.gain for extinction
 
@@ -71,7 +71,7 @@ class Slices(InspectionGrid):
 
 @dataclass(frozen=True, eq=False)
 class Isosurfaces(InspectionGrid):
-    """Isosurfaces of a grid. They are closed at its border, as if values were 0 outside.
+    """Isosurfaces of a grid. The surfaces are closed at the grid's border, as if values were 0 outside the grid.
 
     Attributes:
         levels: values of the surfaces, at least one. HTML pages show one surface, with a slider for its level.
@@ -82,7 +82,10 @@ class Isosurfaces(InspectionGrid):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Painted:
-    """Base class of layers with a colour per vertex, point or ellipsoid: from values on a scale, explicit, or white."""
+    """Base class of layers with a colour per vertex, point or ellipsoid.
+
+    The colours come from ``values`` and ``scale``, else from ``colours``; without these, the layer is white.
+    """
 
     values: np.ndarray | None = None  # (N,) numbers, one per vertex, point or ellipsoid; with scale
     scale: Scale | None = None  # colours of values
@@ -95,7 +98,7 @@ class Ellipsoids(Painted):
     """N solid ellipsoids; put the most important first, since HTML pages show a limited number.
 
     Attributes:
-        axes: (N, 3, 3) semi-axes as vectors, ``axes[n, k]`` the k-th, scene units.
+        axes: (N, 3, 3) semi-axes, scene units; the vector ``axes[n, k]`` is semi-axis k of ellipsoid n.
     """
 
     centres: np.ndarray  # (N, 3) centres, scene units

@@ -89,7 +89,7 @@ DIFFERENCE = Inspector(API_VERSION, "difference", "model minus ground truth", _i
 # ---------------------------------------------------------------- viewpoints
 
 _DIRECTIONS = {"x": (-0.45, 1.0, -1.6), "y": (1.0, 0.45, 1.6), "z": (1.0, -1.6, 0.45)}
-"""Upward axis of the scene -> direction from the centre of the picture to the camera, of any length."""
+"""Upward axis of the scene -> vector of any length that points from the centre of the picture to the camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ class Viewpoint:
 
 
 def find_inspection_viewpoint(inspector: Inspector, frame: InspectionFrame, up: str) -> Viewpoint:
-    """Choose the initial camera of an inspector's view: it shows the whole grid, or the primitive shown alone.
+    """Choose the initial camera of an inspector's view. The camera shows the whole grid, or a primitive shown alone.
 
     Args:
         up: the scene's upward axis, "x", "y" or "z".

@@ -46,7 +46,7 @@ def list_inspection_panels(inspectors: Sequence[Inspector], with_truth: bool) ->
 
 
 class Window:
-    """A pyvista window, or picture off screen, with one panel per (inspector, side).
+    """A pyvista window, or picture off screen, with one panel per (inspector, side); side is "model" or "truth".
 
     All panels that show the whole scene share one camera.
 
@@ -178,7 +178,7 @@ def _add_pyvista_box(plotter: Any, box: np.ndarray) -> None:
 
 
 def _add_pyvista_bar(plotter: Any, scale: Scale, panel: int, place: int) -> None:
-    """Draw a colour bar for ``scale`` into panel number ``panel``; ``place`` counts its bars from the lowest, 0."""
+    """Draw a colour bar for ``scale`` into panel number ``panel``; ``place`` 0 is the lowest bar of the panel."""
     import pyvista
 
     mapper = pyvista.DataSetMapper()

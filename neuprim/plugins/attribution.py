@@ -1,8 +1,8 @@
-"""Call functions of plugins: check what they return, and name the plugin's package in one-line error messages.
+"""Call functions of plugins: check the returned values, and name the plugin's package in one-line error messages.
 
 A :class:`~neuprim.core.errors.NeuprimError` passes unchanged, because its text is written for users. Any other
-exception from a plugin's code becomes a PluginError that says where the exception was raised. The original exception
-is its ``__cause__``. An error in neuprim's own code keeps its type.
+exception from a plugin's code becomes a PluginError that says where the exception was raised. The ``__cause__`` of the
+PluginError is the original exception. An error in neuprim's own code keeps its type.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from neuprim.plugins.registry import LOSSES, SCENES, TASKS, PluginError, PluginG
 Kind = TypeVar("Kind")
 
 _VIEW_METRICS = ("name", "psnr", "ssim", "ssim_3dgs", "lpips", "lpips_3dgs", "seconds")
-"""Metrics that every view has in ``metrics.json``; a task may not use their names."""
+"""Names that neuprim itself uses for the entries of a view in ``metrics.json``; a task's metrics need other names."""
 _TUNABLE = ("model.", "task.options.")
 
 
@@ -47,8 +47,9 @@ class PluginSource:
     """Name and module of a plugin, for error messages.
 
     Attributes:
-        label: e.g. ``"task 'glow' of neuprim-glow 0.1"``.
-        module: top-level module of the plugin's code; empty for a built-in plugin, whose errors keep their tracebacks.
+        label: kind, name and package of the plugin, e.g. ``"task 'glow' of neuprim-glow 0.1"``.
+        module: top-level module of the plugin's code; empty for a built-in plugin. Errors of built-in plugins keep
+            their tracebacks.
     """
 
     label: str
@@ -86,8 +87,9 @@ def _find_plugin_info(group: PluginGroup[Any], package: str | None, entry: str) 
 def attribute_errors(source: PluginSource, function: str = "") -> Iterator[None]:
     """Return a context manager for a call of a plugin's ``function``, e.g. ``"build"``.
 
-    It turns a :class:`ReturnError` and other exceptions into a PluginError that names the plugin ``source``. Other
-    NeuprimErrors, errors of the disk and exceptions of built-in plugins pass unchanged.
+    The context manager turns a :class:`ReturnError` into a PluginError that names the plugin ``source``. It does the
+    same with an exception that is not a NeuprimError, unless the plugin is built in or the disk failed. All other
+    exceptions pass unchanged.
     """
     where = f"{function} of {source.label}" if function else source.label
     try:
@@ -154,8 +156,8 @@ class RunPlugins:
     def attribute_errors(self) -> Iterator[None]:
         """Return a context manager for code that calls several plugins of the run.
 
-        An exception from a plugin's code becomes an error that names the plugin. A NeuprimError passes unchanged,
-        except an invalid return value or data set.
+        An exception from a plugin's code becomes an error that names the plugin. A :class:`ReturnError` or a
+        DatasetError gets the plugin's name, too. Any other NeuprimError passes unchanged.
         """
         try:
             yield
@@ -178,7 +180,7 @@ class RunPlugins:
 
 
 def check_returns(ok: bool, function: str, found: object, expected: str) -> None:
-    """Raise ReturnError unless ``ok``; message: ``function`` returned ``found``, and ``expected`` was required."""
+    """Raise ReturnError unless ``ok``. The message names the function, the value found and the value expected."""
     if not ok:
         raise ReturnError(f"{function}: found {found}; expected {expected}")
 
@@ -247,7 +249,10 @@ def call_task_facts(task: TaskSpec, dataset: Dataset) -> dict[str, Any]:
 
 
 def call_task_clips(task: TaskSpec, dataset: Dataset) -> list[Clip]:
-    """Return the films that the task defines, each a sequence of views of the data set; check that the views exist."""
+    """Return the films that the task defines; check that their views exist.
+
+    A film is a sequence of views of the data set.
+    """
     clips = _check_returned_list(task.clips(dataset), "clips", Clip)
     for clip in clips:
         count = len(dataset.test if clip.source is None else clip.source)
@@ -287,7 +292,7 @@ def draw_task_layer(spec: LayerSpec, frame: LayerFrame, channels: int) -> Tensor
 
     Returns:
         Finite (H, W, C) values without gradient; None if the model lacks the layer. C is the number of channels that
-        the layer names, or ``channels``, that of the model's image, if it names none (a layer of light).
+        the layer names. A layer of light names none; C is then ``channels``, the number of the image's channels.
     """
     values = spec.draw(frame)
     if values is None:

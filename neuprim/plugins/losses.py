@@ -1,5 +1,7 @@
-"""Built-in losses, which any task may use with ``train.loss=NAME``. They are registered like losses of other
-packages."""
+"""Built-in losses, which any task may use with ``train.loss=NAME``.
+
+Built-in losses are registered like the losses of other packages.
+"""
 
 from __future__ import annotations
 

@@ -24,7 +24,8 @@ def write_plugin_package(name: str, out: Path | None = None) -> list[str]:
         out: the folder to create; None for ``neuprim-NAME`` in the working directory.
 
     Raises:
-        ConfigError: the name is not valid for a task or is taken, or the folder exists. Nothing is written then.
+        ConfigError: the name is not valid for a task, an installed task has the name, or the folder exists. Nothing
+            is written then.
     """
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,39}", name) or keyword.iskeyword(name):
         raise ConfigError(

@@ -1,7 +1,7 @@
 """Record which packages and versions made a run, and load the same plugins again.
 
-``config.yaml`` stores the record under ``made_by``. A stored run is read with the plugins of the packages that made it,
-even if a bare name now means the plugin of another package.
+``config.yaml`` stores the record under ``made_by``. A stored run is read with the plugins of the packages that made the
+run, even if a plugin's bare name now means the plugin of another package.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class PluginVersion:
     def of(cls, info: PluginInfo, name: str | None = None) -> PluginVersion:
         """Return package and version of an installed plugin.
 
-        ``name`` is the plugin's name if it differs from the entry point's, e.g. of a scene; None if they are equal.
+        ``name`` is the plugin's name; None if it equals the name of the entry point. For a scene, the names differ.
         """
         version = "".join(c for c in info.version if c.isprintable())[:_LONGEST]  # so that it can be read again
         return cls(info.name if name is None else name, info.distribution, version)
@@ -109,7 +109,7 @@ class Provenance:
 
     @classmethod
     def from_dict(cls, value: object) -> Provenance:
-        """Validate and convert the values of :meth:`to_dict`, which come from an untrusted file."""
+        """Validate values in the form of :meth:`to_dict`, read from an untrusted file; return the provenance."""
         return validate_settings(cls, value, "made_by")
 
     def origins(self) -> dict[str, str]:
@@ -120,7 +120,7 @@ class Provenance:
 def load_recorded_plugin(
     group: PluginGroup[T], plugin: PluginVersion, file: Path | None = None, entry: str | None = None
 ) -> tuple[PluginInfo, T]:
-    """Load the plugin that made a run, and warn if another version of it is installed.
+    """Load the plugin that made a run, and warn if another version of the plugin is installed.
 
     Args:
         plugin: the package and version that made the run.

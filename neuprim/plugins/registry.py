@@ -1,10 +1,10 @@
 """Find and load plugins: tasks, scenes, losses, exporters and inspectors, registered as entry points.
 
-Built-in plugins are registered like those of any other package. Listing plugins reads package metadata only. A plugin
-is imported when it is chosen by name, so a broken plugin does not affect other plugins.
+Built-in plugins are registered like the plugins of any other package. Listing plugins reads package metadata only. A
+plugin is imported when it is chosen by name, so a broken plugin does not affect other plugins.
 
-Users choose a plugin by ``NAME`` or ``PACKAGE:NAME``. A bare name means the built-in plugin of that name if there is
-one, even if other packages register the name, too.
+Users choose a plugin by ``NAME`` or ``PACKAGE:NAME``. If there is a built-in plugin of that name, a bare name means
+the built-in plugin, even if other packages register the name, too.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def qualified_plugin_name(distribution: str, name: str) -> str:
 
 
 def installed_version(package: str) -> str | None:
-    """Return "NAME VERSION" of an installed distribution, or None if it is not installed."""
+    """Return "NAME VERSION" of the distribution ``package``; None if this distribution is not installed."""
     try:
         found = metadata.distribution(package)
     except (metadata.PackageNotFoundError, ValueError):  # ValueError: an empty name
@@ -101,9 +101,10 @@ class PluginGroup(Generic[T]):
 
     Attributes:
         entry_points: name of the entry-point group.
-        kind: word for one such plugin in messages, e.g. "task".
-        typed: how a user chooses such a plugin, e.g. ``"task={}"``.
-        described_by: ``module:class`` of the descriptions; imported with the first plugin, because it imports torch.
+        kind: word for a plugin of this kind in messages, e.g. "task".
+        typed: what a user types to choose a plugin of this kind, e.g. ``"task={}"`` with the plugin's name for ``{}``.
+        described_by: ``module:class`` of the descriptions. The module is only imported when the first plugin is loaded,
+            because the module imports torch.
         name_of: function that returns the name in a description, which must equal the entry point's name.
         typed_name: function that converts an entry point's name to what a user types.
     """
@@ -156,15 +157,15 @@ class PluginGroup(Generic[T]):
         return self.typed.format(qualified_plugin_name(info.distribution, self.typed_name(info.name)))
 
     def shortest_name(self, info: PluginInfo) -> str:
-        """Return the bare ``NAME`` of a plugin if typing it chooses this plugin, else ``PACKAGE:NAME``."""
+        """Return the shortest name that chooses this plugin: the bare ``NAME`` if possible, else ``PACKAGE:NAME``."""
         name = self.typed_name(info.name)
         clash = any(other.name == info.name and other != info for other in self.list_plugins())
         return qualified_plugin_name(info.distribution, name) if clash and not info.built_in else name
 
     def warn_of_hidden(self, info: PluginInfo, by: str) -> None:
-        """Warn that the bare name of the plugin ``info`` chooses another plugin of the same name, described by ``by``.
+        """Warn that the bare name of the plugin ``info`` chooses another plugin of the same name.
 
-        The warning also says what to type to choose ``info``.
+        The text ``by`` describes the chosen plugin. The warning also says what to type to choose ``info``.
         """
         what = f"{self.kind} {self.typed_name(info.name)!r} of {info.origin}"
         warn_once(f"two plugins have the same name: {by} is used, not {what}; to use it, write {self.choice(info)}")
@@ -200,7 +201,7 @@ class PluginGroup(Generic[T]):
     def _entries(self) -> list[tuple[PluginInfo, metadata.EntryPoint]]:
         """List the entry points of this kind of plugin, with their registrations, sorted by name, built-in ones first.
 
-        If sys.path has several copies of a package, only the copy that is imported counts.
+        If sys.path has several copies of a package, only the entry points of the copy that Python imports are listed.
         """
         found, packages = [], set()
         for dist in metadata.distributions():
@@ -256,7 +257,8 @@ SCENES: PluginGroup[SceneExtension] = PluginGroup(
     lambda extension: f"{extension.task}.{extension.scene.name}",
     lambda name: name.partition(".")[2],
 )
-"""Entry points of scenes are named ``TASK.SCENE``, so metadata alone says which scenes a task has."""
+"""Scenes that packages add to tasks. Their entry points are named ``TASK.SCENE``, so that package metadata alone says
+which scenes are added to a task."""
 LOSSES: PluginGroup[LossExtension] = PluginGroup(
     "neuprim.losses", "loss", "train.loss={}", "neuprim.core.extensions:LossExtension"
 )
@@ -277,8 +279,9 @@ def load_task(name: str) -> TaskSpec:
 def list_scene_names(task: PluginInfo) -> list[str]:
     """List the scenes of a task without importing it.
 
-    The task's own scenes are the YAML files in ``conf/scene/NAME`` beside its module. Other packages may register more.
-    If a task has its YAML files elsewhere, only scenes of other packages are listed.
+    The task's own scenes are the YAML files in the folder ``conf/scene/NAME`` of the package that defines the task
+    ``NAME``. Scenes that other packages register are listed, too. If the YAML files of a task are in another folder,
+    only the registered scenes are listed.
     """
     added = [SCENES.typed_name(info.name) for info in SCENES.list_plugins() if info.name.startswith(f"{task.name}.")]
     try:
@@ -292,7 +295,7 @@ def list_scene_names(task: PluginInfo) -> list[str]:
 
 @dataclass(frozen=True)
 class FoundScene:
-    """A scene of a task, with the package that provides it: the task's own or another."""
+    """A scene of a task, with the package that provides the scene: the task's own package or another package."""
 
     spec: SceneSpec  # the scene
     config_package: str  # the package with scene/TASK/NAME.yaml
@@ -300,8 +303,9 @@ class FoundScene:
 
 
 def find_registered_scene(task: TaskSpec, word: str) -> FoundScene:
-    """Return the scene ``NAME`` or ``PACKAGE:NAME`` of a task. A bare name means the task's own scene of that name, if
-    any.
+    """Return the scene ``NAME`` or ``PACKAGE:NAME`` of a task.
+
+    A bare ``NAME`` means the task's own scene of that name; if there is none, a scene that another package registers.
 
     Raises UnknownPlugin, or PluginError if the scene's plugin is broken.
     """

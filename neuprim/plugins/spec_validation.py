@@ -125,7 +125,10 @@ def _check_exporter(spec: Exporter) -> None:
 
 
 def _check_plugin_options(spec: TaskSpec | LossExtension, *groups: str) -> None:
-    """Check a description's ``options``, and its ``uses``, which may only name optional settings of ``groups``."""
+    """Check the members ``options`` and ``uses`` of a plugin's description.
+
+    ``uses`` may only name optional settings whose names begin with one of ``groups``, e.g. "train.".
+    """
     for name, entry in spec.options.items():
         known = isinstance(name, str) and name.isidentifier()
         _require_member(known, f"options has {name!r}; expected a name of letters, digits and _")

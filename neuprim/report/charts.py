@@ -31,17 +31,18 @@ _VARIABLES = {INK: "var(--muted)", GRID: "var(--line)", TRAINING: "var(--trainin
 _PNG_COLOURS = {INK: "#5d6670", GRID: "#e2e4e3", TRAINING: "#6884a6", HELD_OUT: "#c9551c"}
 
 SMALL, LARGE = (360, 210), (540, 300)
-"""(width, height) of charts in points. Panels are about as wide in CSS pixels, so text keeps its size."""
+"""Sizes (width, height) of charts in points. A page shows a chart at about as many CSS pixels, so that the text keeps
+its size."""
 
 _BUCKETS = 120
 """Number of groups into which the points of a long line are divided. Each group is drawn as its median and range. A
-line of at most twice as many points is drawn without groups."""
+line is long if it has more than twice this number of points."""
 
 _FEW = 40  # points of a line up to which each is marked
 
 _LOG_RATIO, _FRONT_LOG_RATIO = 4.0, 1.5
-"""Least ratio of largest to smallest value for a logarithmic axis: the y axis of a positive curve, and the x axis of a
-chart of quality against cost."""
+"""Ratios of the largest to the smallest value from which an axis is logarithmic. The first ratio is for the y axis of
+curves with positive values, the second for the x axis of charts of quality against cost."""
 
 _LEAST_DECIBELS = 0.4  # least range of the y axis of a front: smaller differences are invisible
 
@@ -52,7 +53,8 @@ class ChartPoints:
 
     Attributes:
         joined: connect the points by a line; markers are only drawn if there are few points.
-        band: draw many points as a line of medians, with a band from minimum to maximum, over groups of points.
+        band: divide many points into groups; draw a line of the groups' medians, and a band from their minima to
+            their maxima.
         spread: half-lengths of horizontal error bars; no bars if empty.
         labels: texts below the points.
         name: text in the chart's legend.
@@ -84,7 +86,7 @@ class Chart:
         title: text for screen readers, and the heading above a PNG.
         ring: (x, y) of a point that is highlighted by a ring.
         log_x, log_y: whether the axis is logarithmic.
-        least: smallest difference between top and bottom of the y axis.
+        least: smallest range of the y axis. The axis is extended if the values have a smaller range.
     """
 
     title: str
@@ -109,7 +111,7 @@ class Dot(NamedTuple):
         cost, spread: cost, drawn along x, and the half-length of its error bar.
         good: quality, drawn along y.
         mark: text beside a point on the Pareto front; None for a point that is not on the front.
-        reference: whether other points are compared with this point. It is highlighted by a ring.
+        reference: whether other points are compared with this point. A ring highlights this point.
     """
 
     cost: float
@@ -126,7 +128,7 @@ def curve_chart(
 
     Args:
         unit: label of the x axis. "seconds" becomes minutes or hours for long times.
-        log: use a logarithmic y axis if the values span a large factor.
+        log: use a logarithmic y axis if all values are positive and the largest is at least four times the smallest.
     """
     known = [line.finite() for line in lines]
     longest, divisor = float(max((np.max(line.x) for line in known if len(line.x)), default=0.0)), 1.0
@@ -144,7 +146,8 @@ def front_chart(
 
     Args:
         joined: connect the points of the front by a line.
-        most: largest cost shown; more expensive points off the front are left out, and the x axis says how many.
+        most: largest cost shown. Points with a higher cost are left out, unless they are on the front. The label of
+            the x axis says how many are left out.
     """
     known = [dot for dot in dots if math.isfinite(dot.cost) and math.isfinite(dot.good) and dot.cost > 0]
     drawn = [dot for dot in known if dot.cost <= most or dot.mark is not None]
@@ -263,7 +266,10 @@ def _format_tick(value: float) -> str:
 
 
 def _style() -> AbstractContextManager[None]:
-    """Return a context manager with matplotlib's settings for all charts, from creating axes to writing the file."""
+    """Return a context manager that applies the matplotlib settings of all charts.
+
+    Create the axes and write the file inside this context.
+    """
     import matplotlib  # slow to import, and only reports need it
 
     settings: Any = {"svg.fonttype": "none", "svg.hashsalt": "neuprim", "font.size": 10}
@@ -273,7 +279,7 @@ def _style() -> AbstractContextManager[None]:
 
 
 def _chart_to_svg_element(figure: Figure, label: str) -> str:
-    """Return a matplotlib figure as an ``<svg>`` element for a page. ``label`` is its text for screen readers.
+    """Return a matplotlib figure as an ``<svg>`` element for a page. ``label`` is the text for screen readers.
 
     The element has the page's font, no outside addresses, no global styles, and ids that are unique for each label.
     """

@@ -33,8 +33,8 @@ _STEPS = 8  # candidate positions per length of a region's side
 def error_map(rendered: Tensor, truth: Tensor, scale: float = ERROR_SCALE) -> NDArray[np.uint8]:
     """Colour the error of a view on a fixed scale, so that maps of different views and runs can be compared.
 
-    The mean absolute difference over channels runs linearly from 0 (black) to ``scale`` (pale yellow) through
-    matplotlib's perceptually uniform "inferno"; larger errors are drawn as ``scale``.
+    The error of a pixel is the mean absolute difference over channels. The colour map is matplotlib's perceptually
+    uniform "inferno", linear from 0 (black) to ``scale`` (pale yellow). Larger errors are drawn as ``scale``.
 
     Args:
         rendered, truth: (H, W, C) float images in the same colour space.
@@ -108,7 +108,9 @@ class Region:
 
 
 def worst_region(view: str, rendered: Tensor, truth: Tensor) -> Region:
-    """Return the square with the largest mean squared error; its side is a quarter of the image's shorter side.
+    """Return the square region with the largest mean squared error.
+
+    The side of the square is a quarter of the image's shorter side, but at least 16 pixels if the image is that large.
 
     Args:
         rendered, truth: (H, W, C) images in the same colour space.
@@ -125,7 +127,7 @@ def worst_region(view: str, rendered: Tensor, truth: Tensor) -> Region:
 
 
 class WorstRegions:
-    """Collect the worst region of each view while views are measured, and write pictures of the worst ones.
+    """Collector of the worst region of each view. It stores the worst :data:`MAX_REGIONS` and writes pictures of them.
 
     Args:
         display: function that converts a linear or multi-channel image to the displayed image.
@@ -136,7 +138,7 @@ class WorstRegions:
         self._found: list[tuple[Region, Tensor]] = []
 
     def add_view(self, name: str, rendered: Tensor, truth: Tensor) -> None:
-        """Find and store the worst region of a view."""
+        """Find the worst region of a view and store the region, unless the view has no error."""
         region = worst_region(name, rendered, truth)
         if not math.isfinite(region.psnr):
             return

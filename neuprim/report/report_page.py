@@ -1,7 +1,7 @@
 """The template of all report pages, the HTML elements in them, and functions that format values.
 
-Every page is one file: pictures and charts are embedded, and its content security policy forbids loading anything else.
-Every function escapes its text arguments, unless its docstring says that they are HTML.
+Every page is one file: it embeds its pictures and charts, and its content security policy forbids loading other files.
+Every function escapes its text arguments, unless its docstring says that these arguments are HTML.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def figure(source: Path | Tensor, caption: str, alternative: str, attributes: st
 
     Args:
         source: a picture file, or an (H, W, 3) image.
-        caption, alternative: the text below the picture and its ``alt`` text, both as HTML.
+        caption, alternative: the text below the picture, and the ``alt`` text of the picture, both as HTML.
         attributes: HTML attributes of the ``<figure>`` element.
     """
     under = f"<figcaption>{caption}</figcaption>" if caption else ""
@@ -143,7 +143,7 @@ def fact_list(pairs: Iterable[tuple[str, object]]) -> str:
 
 
 def escape(value: object) -> str:
-    """Return ``value`` as HTML text that is also safe inside a quoted attribute; a dash if it is None or empty."""
+    """Return ``value`` as HTML text that is also safe inside a quoted attribute; a dash for None or an empty text."""
     return MISSING if value is None or value == "" else html.escape(format_report_setting(value), quote=True)
 
 

@@ -58,7 +58,7 @@ class ReportedRun:
         return entries[view.index] if view.index < len(entries) else {}
 
     def series(self, x: str, y: str) -> tuple[list[float], list[float]]:
-        """Return the values of the keys ``x`` and ``y`` from all log lines in which both are finite."""
+        """Return two lists: the values of the keys ``x`` and ``y`` in all log lines where both values are finite."""
         pairs = [(as_reported_number(line.get(x)), as_reported_number(line.get(y))) for line in self.log]
         known = [(a, b) for a, b in pairs if a is not None and b is not None]
         return [a for a, _ in known], [b for _, b in known]
@@ -67,7 +67,7 @@ class ReportedRun:
 def median_and_worst(views: Sequence[Mapping[str, Any]]) -> tuple[int, ...]:
     """Return the indices of the view with the median PSNR (the lower of two) and of the view with the lowest PSNR.
 
-    If both are the same view, its index is returned once.
+    If one view has both properties, its index is returned once.
 
     Args:
         views: entries of ``per_view`` in ``metrics.json``; entries without a PSNR are left out.
@@ -115,7 +115,7 @@ def _parse_reported_line(text: str) -> Mapping[str, Any] | None:
 def _find_reported_views(folder: Path) -> list[ViewFiles]:
     """Return the picture files of the held-out views in ``folder``, in order of the views.
 
-    Views without an error map are left out, because that picture is written last.
+    Views without an error map are left out: a view's error map is written last, so the view is not complete.
     """
     views = []
     for error in folder.glob("test_*_error.png"):

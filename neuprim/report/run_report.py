@@ -40,7 +40,10 @@ _VIEWER_FILE = "viewer.html"
 
 @dataclass(frozen=True)
 class Viewer:
-    """An HTML page that renders the model, and its scripts' nonce, which the report's content policy must allow."""
+    """An HTML page that renders the model, and the nonce of the page's scripts.
+
+    The report's content policy must allow this nonce, because the report embeds the page.
+    """
 
     text: str
     nonce: str
@@ -59,8 +62,8 @@ def write_report(
 
     Args:
         conditions: conditions of the run's task, for which the page shows commands that animate them.
-        viewer: page that renders the model. It is embedded, or written as ``viewer.html`` if the report would exceed
-            :data:`VIEWER_LIMIT`.
+        viewer: page that renders the model. The report embeds this page. If the report would then exceed
+            :data:`VIEWER_LIMIT`, the page is written to ``viewer.html`` instead, and the report has a link.
         regions: the worst regions with their pictures, worst first.
         command: command line that made the run; "" if no single command made it.
 

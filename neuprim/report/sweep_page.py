@@ -21,18 +21,19 @@ _LESS = (
     *("lpips", "flip", "model_bytes", "primitives", "parameters", "train_seconds"),
     *("sigma_relative", "sigma_max_error"),
 )
-"""Prefixes of names of metrics: higher is better, and lower is better. Other metrics are not ranked."""
+"""Beginnings of metric names. ``_MORE``: a higher value is better. ``_LESS``: a lower value is better. Other metrics
+are not ranked."""
 
 _FIRST = (
     *("psnr", "ssim", "psnr_worst", "psnr_mask", "lpips"),
     *("primitives", "model_bytes", "train_seconds", "render_fps", "iterations"),
 )
-"""Metrics in the order of the table; the others follow."""
+"""Metrics of the table's first columns, in order. Other metrics that differ between runs follow."""
 
 _TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "model_bytes": "model file", "train_seconds": "training"}
 
 _NOT_COMPARED = ("psnr_black_image", "seed", "vdb_bytes")
-"""Prefixes of names of metrics that describe the data or the request instead of the result."""
+"""Beginnings of the names of metrics that are not in the table, because they describe the data or the settings."""
 
 _MOST_PICTURES, _MOST_VIEWS = 8, 3  # runs whose pictures are shown, and held-out views of each
 
@@ -66,7 +67,7 @@ class SweepPageRun:
 
 
 def better_sign(name: str) -> int:
-    """Return 1 if a higher value of the metric is better, -1 if a lower one is better, 0 if this is not known."""
+    """Return 1 if a higher value of the metric is better, -1 if a lower value is better, 0 if neither is known."""
     if name == "parameters_per_primitive":
         return 0
     signs = {**dict.fromkeys(_MORE, 1), **dict.fromkeys(_LESS, -1)}
@@ -76,10 +77,10 @@ def better_sign(name: str) -> int:
 def write_sweep_page(folder: Path, runs: Sequence[SweepPageRun], words: Sequence[str]) -> Path:
     """Write ``sweep.html`` into the directory of a sweep, finished or not; return the path.
 
-    The page needs no other files. Runs are sorted by mean PSNR until a script sorts them otherwise.
+    The page needs no other files. Runs are sorted by mean PSNR until a script sorts the runs by another column.
 
     Args:
-        words: overrides of the sweep, as after ``neuprim run -m``.
+        words: command-line overrides that define the sweep, as typed after ``neuprim run -m``.
     """
     colours = dict(zip((run.name for run in runs), _run_colours(len(runs)), strict=True))
     runs = sorted(runs, key=lambda run: -run.numbers.get("psnr", -math.inf))
@@ -172,7 +173,7 @@ def _charts(runs: Sequence[SweepPageRun], colours: Mapping[str, str]) -> str:
 
 
 def _views_side_by_side(runs: Sequence[SweepPageRun]) -> str:
-    """Return HTML with a few evenly spread held-out views of the first runs in ``runs``, which is sorted best first."""
+    """Return HTML with a few evenly spread held-out views of the best runs; ``runs`` are sorted best first."""
     pictured = [run for run in runs if run.run.views]
     if not pictured:
         return ""

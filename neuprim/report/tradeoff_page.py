@@ -42,7 +42,7 @@ def write_tradeoff_page(
 
     Args:
         record: content of ``tradeoff.json``: points are render configurations of a finished run, or trained models.
-        pictures: number of a point -> its picture; -1 is the ground truth.
+        pictures: index of a point -> the point's picture; the index -1 stands for the ground truth.
         command: function that returns, for a point's overrides, the command that renders or trains the point.
     """
     page = _TradeoffPage(record, pictures, command)
@@ -94,7 +94,7 @@ class _TradeoffPage:
     def fronts(self) -> list[Chart]:
         """Return two charts: PSNR against time, and PSNR against bytes.
 
-        For a finished run, the second chart has the run's model and smaller ones only.
+        For the trade-offs of a finished run, the second chart has only the run's model and smaller models.
         """
         bytes_of = [float(point["bytes"]) for point in self.points]
         sized = [i for i, size in enumerate(bytes_of) if self.trained or i == 0 or size < bytes_of[0]]

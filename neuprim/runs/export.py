@@ -72,7 +72,7 @@ def export_run(
 
 
 def _write_export_sequence(job: ExportJob, exporter: Exporter) -> ExportReport:
-    """Write one file per frame into the folder ``job.out``, numbered as the model's source, if it has numbers."""
+    """Write one file per frame into the folder ``job.out``, with the frame numbers of the model's source if known."""
     frames = job.frames(several=True)
     numbers, name = frame_numbers(job.run.header, frames), Path(_export_file_name(exporter))
     width = max(4, len(str(max(numbers))))
@@ -97,7 +97,7 @@ def _export_file_name(exporter: Exporter) -> str:
 def _run_export_destination(run_dir: Path, exporter: Exporter, out: Path | None, several: bool) -> Path:
     """Return the path to write: ``out``, or a path in ``RUN_DIR/export`` with the exporter's default file name.
 
-    With ``several`` frames, it is a folder. Raises ConfigError if the suffix of ``out`` does not fit the exporter.
+    With ``several`` frames, this is a folder. Raises ConfigError if the suffix of ``out`` does not fit the exporter.
     """
     if out is None:
         name = _export_file_name(exporter)
@@ -143,7 +143,8 @@ def _parse_run_export_options(
     options = {name: default for name, (default, _) in exporter.options.items()}
     conditions, rest = split_conditions(words, specs)
     if conditions and not exporter.conditions:
-        raise ConfigError(f"{condition_flag(next(iter(conditions)))}: --format {exporter.name} takes no conditions")
+        flag = condition_flag(next(iter(conditions)))
+        raise ConfigError(f"{flag}: --format {exporter.name} takes no conditions; leave out {flag}")
     given = set()
     for word in rest:
         key, equals, text = word.partition("=")
@@ -153,7 +154,7 @@ def _parse_run_export_options(
             raise ConfigError(f"{key}: given twice")
         if key not in exporter.options:
             conditions_of_task = (condition_flag(spec.name) for spec in specs) if exporter.conditions else ()
-            hint = nearest(key, [*exporter.options, *conditions_of_task]) or "; it has none"
+            hint = nearest(key, [*exporter.options, *conditions_of_task]) or "; this format has no options"
             raise ConfigError(f"{key}: no such option of --format {exporter.name}{hint}")
         given.add(key)
         options[key] = _parse_run_export_option(text)
@@ -178,8 +179,8 @@ def import_run_directory(path: Path, out: Path, name: str | None = None) -> Path
     """Create a run directory from a file written by a lossless exporter or by ``neuprim compress``; return its path.
 
     The new directory holds ``config.yaml``, and the model as ``model.safetensors``, or compressed as
-    ``model.neuprim``. Commands accept it like the original run. ``name`` is the format of the file; None for the format
-    that its suffix names.
+    ``model.neuprim``. Commands accept the directory like the original run. ``name`` is the format of the file; None for
+    the format that the suffix of ``path`` names.
 
     Raises:
         ConfigError: ``out`` exists and is not empty, or no format reads such files.
@@ -189,7 +190,7 @@ def import_run_directory(path: Path, out: Path, name: str | None = None) -> Path
     if not path.is_file():
         raise DataError(f"{path}: no such file")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ConfigError(f"--out {out}: exists and is not an empty folder")
+        raise ConfigError(f"--out {out}: exists and is not an empty folder; expected a new or empty folder")
     if name is None and is_compressed(path):
         config = checkpoint.checkpoint_config(path)
         if config is None:
@@ -214,7 +215,7 @@ def import_run_directory(path: Path, out: Path, name: str | None = None) -> Path
 def import_model_as_run(stored: StoredModel, path: Path, out: Path) -> Path:
     """Write a model that was read from the exported file ``path`` as the run directory ``out``; return ``out``.
 
-    The directory has a temporary name until it has been loaded once as a check.
+    The directory gets its final name only after the model was loaded from it once, as a check.
     """
     header: Mapping[str, Any] = {key: value for key, value in stored.header.items() if key not in ("format", "kind")}
     tensors = {name: torch.from_numpy(value) for name, value in stored.tensors.items()}

@@ -42,8 +42,8 @@ _CURVE_PSNR_MAX = 200.0
 """Upper bound of a view's PSNR during the training, dB. Equal images have an infinite PSNR, which JSON cannot store."""
 
 _TRIAL_PRIMITIVES, _TRIAL_STEPS, _TRIAL_SECONDS, _TRIAL_WARM = 10_000, 20, 2.0, 3
-"""Trial training that measures the time per step: number of primitives (fewer if the data offer fewer starting points),
-largest number of timed steps, largest time in seconds, and warm-up steps before the clock starts."""
+"""Trial training that measures the time per step: number of primitives, largest number of timed steps, largest time in
+seconds, warm-up steps before the clock starts. If the data offer fewer starting points, there are fewer primitives."""
 
 
 __all__ = ["Evaluated", "Finishing", "Fitted", "Note", "Preparing", "Step", "fit"]
@@ -100,12 +100,12 @@ def ignore_run_event(event: Event) -> None:
 
 
 TrainerFactory = Callable[[Job, Dataset, Loss], Trainer]
-"""Function (job, its data set, its loss) -> trainer that continues an existing model, not an untrained one."""
+"""Function (job, data set, loss) -> trainer that continues an existing model instead of starting an untrained one."""
 
 
 @dataclass(frozen=True)
 class Fitted(Job):
-    """A trained model with its configuration, data and trainer; what :func:`fit` returns."""
+    """A trained model with its configuration, data and trainer: the result of :func:`fit`."""
 
     dataset: Dataset
     channels: Channels
@@ -172,8 +172,8 @@ def prepare_training(
     """Load the data and create loss, model and trainer, without training. Raises the errors of :func:`fit`.
 
     Args:
-        hold_out: n > 1 holds out one of every n training views and measures them instead of the test views; 0 uses
-            the splits unchanged.
+        hold_out: n > 1 holds out every n-th training view. The held-out views are measured instead of the test
+            views. 0 uses the splits unchanged.
         make: function that makes the trainer; None for :func:`make_run_trainer`, which creates an untrained model.
         group: the ranks (processes) that train the model together; None for one process.
     """

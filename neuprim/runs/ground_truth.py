@@ -51,7 +51,7 @@ def launch_ground_truth_jobs(
     """Render the missing frames of a scene's ground truth with a launcher. Return the ground-truth images; None if the
     scene does not render them frame by frame.
 
-    Each new frame is stored at once. The first frame that fails stops the others, because a run needs all frames. The
+    Each new frame is stored at once. The first frame that fails ends the work, because a run needs all frames. The
     launcher's temporary files are in the run directory's parent.
 
     Raises:

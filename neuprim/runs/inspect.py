@@ -197,7 +197,8 @@ class _RunFrames:
         else:
             box = find_inspection_box(self.model, wanted)
         if request.grid**3 > POINTS_LIMIT:
-            raise ConfigError(f"--grid {request.grid}: expected at most {round(POINTS_LIMIT ** (1 / 3))}")
+            most = round(POINTS_LIMIT ** (1 / 3))
+            raise ConfigError(f"--grid {request.grid}: expected at most {most} points per side")
         self.matrix, self.shape = box_lattice(box, request.grid)
         self.numbers = [self._compare_frame(i, events) for i in range(len(self))]
         self.top, self.gain, self.focus = self._find_scale(box)
@@ -245,7 +246,7 @@ class _RunFrames:
         return _round_scale_of_run_frames(most), _DEPTH / depth if depth > 0 else 1.0, tuple(focus.tolist())
 
     def frame(self, index: int) -> InspectionFrame:
-        """Return frame ``index`` of the inspection; it computes its voxel grids on first use."""
+        """Return frame ``index`` of the inspection. The frame computes its voxel grids on first use."""
         conditions, number = self.pairs[index]
         truth = self.truth
         return InspectionFrame(

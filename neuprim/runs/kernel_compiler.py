@@ -34,8 +34,8 @@ _SIZE, _PRIMITIVES, _POINTS = 32, 64, 64  # of the noise: pixels a side, primiti
 class KernelCompiler:
     """Second process that compiles the CPU kernels of a run while the first process loads the data.
 
-    The process does not start if a run of the task has compiled the kernels before, if the task is not built in, if
-    there is only one core, or if torch finds a CUDA device.
+    The process only starts for a built-in task whose kernels no run has compiled before. It does not start on a machine
+    with only one core, or if torch finds a CUDA device.
 
     Args:
         config: configuration of the run.
@@ -69,7 +69,7 @@ class KernelCompiler:
 def _marker(task: str) -> Path:
     """Return the path of a marker file, which exists if the kernels of this version were compiled for ``task``.
 
-    There is one marker for all models of a task, because most kernels serve all of them.
+    There is one marker for all models of a task, because they share most kernels.
     """
     return cache_directory() / f"compiled-{sources_hash(Path(backend.__file__))}-{task}"
 

@@ -1,11 +1,11 @@
 """Measure a model: metrics of every held-out view, their means, and further metrics of the task.
 
-PSNR and SSIM compare float images in the data set's own colour space, unclamped and unquantised. For linear RGB images
-both are also computed after the sRGB transfer curve (``psnr_srgb``, ``ssim_srgb``). If the task has its own conversion
-of channels to a displayed image, both are also computed for the displayed image (``psnr_display``, ``ssim_display``).
-If the task masks a part of a view, the error inside the mask is also reported alone, because a black background
-improves the mean. ``ssim_3dgs`` is the SSIM of the displayed image as 3D Gaussian splatting computes it. ``lpips`` is
-LPIPS as published; ``lpips_3dgs`` is LPIPS as 3D Gaussian splatting computes it.
+PSNR and SSIM compare float images in the data set's own colour space, unclamped and unquantised. For linear RGB images,
+PSNR and SSIM are also computed after the sRGB transfer curve (``psnr_srgb``, ``ssim_srgb``). If the task has its own
+conversion of channels to a displayed image, they are also computed for the displayed image (``psnr_display``,
+``ssim_display``). If the task masks a part of a view, the error inside the mask is also reported alone, because a black
+background improves the mean. ``ssim_3dgs`` is the SSIM of the displayed image as 3D Gaussian splatting computes it.
+``lpips`` is LPIPS as published; ``lpips_3dgs`` is LPIPS as 3D Gaussian splatting computes it.
 """
 
 from __future__ import annotations
@@ -88,8 +88,8 @@ def render_light_sum(
 ) -> Tensor:
     """Render a view under several lights at once, as the sum of one image per light: (H, W, C) on the CPU.
 
-    The sum is exact for models that are linear in light, because opacity does not depend on light. It is computed in
-    float64, and the background is added once.
+    The sum is exact for models that are linear in light, because opacity does not depend on light. The sum is
+    computed in float64, and the background is added once.
 
     Args:
         lights: conditions of each light, which replace the view's conditions of the same names.

@@ -74,12 +74,12 @@ class StoredRun(Job):
 
     @property
     def world(self) -> World:
-        """Transform between the model's coordinates and those of the data's files."""
+        """Transform between the coordinates of the model and the coordinates of the data's files."""
         return World.of(self.header, str(model_file(self.directory)))
 
 
 def model_file(run_dir: Path) -> Path:
-    """Return the path of a run's model: ``model.safetensors``, or the compressed file if it is the only one."""
+    """Return the path of a run's model: ``model.safetensors`` or, if this file is missing, the compressed file."""
     full, compressed = run_dir / "model.safetensors", run_dir / COMPRESSED
     return compressed if compressed.exists() and not full.exists() else full
 
@@ -198,8 +198,8 @@ def read_metrics(run_dir: Path) -> dict[str, Any]:
 def kept_shares(model: Primitives) -> dict[str, float]:
     """Return name -> fraction of parameters that pruning has not removed, 0..1, e.g. ``{"density.neuron 0": 0.8}``.
 
-    A name is that of a unit, or of a group of units. A unit is e.g. one neuron: in each primitive, pruning sets all or
-    none of its parameters to zero.
+    Each name is the name of a unit, or of a group of units. A unit is e.g. one neuron. In each primitive, pruning sets
+    all or none of a unit's parameters to zero.
     """
     kept: dict[str, float] = {}
     sizes: dict[str, int] = {}
@@ -217,9 +217,9 @@ def kept_shares(model: Primitives) -> dict[str, float]:
 def lock_run_directory(directory: Path, what: str = "run") -> Iterator[None]:
     """Lock a directory against other processes. A missing directory is created, and removed again if it stays empty.
 
-    The lock is an advisory lock of the system (``flock``; on Windows ``msvcrt``). It ends with the process. On shared
-    folders it works between machines if the file system supports it: NFS from version 4 on, CephFS, GPFS, Lustre
-    mounted with ``flock``.
+    The lock is an advisory lock of the system (``flock``; on Windows ``msvcrt``). The lock ends with the process. It
+    works between machines on shared folders whose file system supports such locks: NFS from version 4 on, CephFS,
+    GPFS, Lustre mounted with ``flock``.
 
     Args:
         what: what the error message calls the directory's content, e.g. "run".
@@ -273,8 +273,8 @@ def result_files(run_dir: Path) -> list[Path]:
 
 
 def discard_results(run_dir: Path) -> None:
-    """Remove a run's result files. A resumed run calls this before its model changes, so that an interruption never
-    leaves metrics of another model."""
+    """Remove a run's result files. A resumed run calls this function before its model changes, so that an
+    interruption never leaves metrics of another model."""
     for path in result_files(run_dir):
         path.unlink(missing_ok=True)
 
@@ -285,5 +285,6 @@ def refuse_run_results(run_dir: Path, targets: Iterable[Path]) -> None:
     for target in targets:
         if target.resolve() in own:
             raise ConfigError(
-                f"{target}: is a picture of the run's report; --force replaces it, --out PATH writes elsewhere"
+                f"{target}: is a picture of the run's report; pass --force to replace it, or --out PATH to write "
+                "elsewhere"
             )

@@ -3,7 +3,7 @@
 renderer.KEY=VALUE       replace a setting of the run's renderer
 resolution=0.5           render at half the width and height, and upsample bilinearly
 density.NAME=N           reduce the density of all primitives, e.g. to fewer neurons (Field.reductions)
-colour.NAME=N            reduce their colour, e.g. to fewer bands of spherical harmonics, lobes or terms in time
+colour.NAME=N            reduce the colour of all primitives, e.g. to fewer bands of spherical harmonics or lobes
 
 A view is rendered as an image, or as layers of one OpenEXR file. The file holds linear light and data such as depth;
 its header holds the camera and the conditions.
@@ -80,7 +80,7 @@ class RenderConfig:
     reduced: Mapping[tuple[str, str], int] = field(default_factory=dict)
 
     def to_overrides(self, defaults: RenderSettings) -> tuple[str, ...]:
-        """Return ``key=value`` texts that :func:`parse_run_rendering`, given ``defaults``, parses to this object."""
+        """Return ``key=value`` texts from which :func:`parse_run_rendering` restores this object, with ``defaults``."""
         before = dataclasses.asdict(defaults)
         values = dataclasses.asdict(self.settings)
         words = [
@@ -180,7 +180,8 @@ class RunExrLayers:
         names: comma-separated names of the layers, as after ``--layers``; None: all layers except those of single
             lights.
         half: whether alpha and the layers that hold light are stored as 16-bit floats.
-        background: (C,) in the model's colour space. Without an alpha layer, beauty is composited over it.
+        background: (C,) in the model's colour space. Without an alpha layer, the layer "beauty" is
+            composited over the background.
         lights: conditions of the lights of an environment map, over which images are summed; empty: the view's light.
         world: coordinates and units of cameras, positions and depths in the file.
         fps: frames per second of the sequence that the images belong to; None if unknown.
@@ -214,8 +215,8 @@ class RunExrLayers:
     def _layer_specs(self) -> tuple[LayerSpec, ...]:
         if self._splits_lights and len(self.lights) > _MOST_LIGHTS:
             raise ConfigError(
-                f"--layers {LIGHTS}: {len(self.lights)} lights, one layer each; expected at most {_MOST_LIGHTS} lights "
-                f"(--environment-samples)"
+                f"--layers {LIGHTS}: {len(self.lights)} lights need one layer each; expected at most {_MOST_LIGHTS} "
+                f"lights (lower --environment-samples)"
             )
         found = select_layers(self.names, self.task.layers, bool(self.lights))
         if self.channels.color_space == "linear":
@@ -251,8 +252,8 @@ class RunExrLayers:
     ) -> dict[str, Tensor]:
         """Render a view; return layer name -> (H, W, C) values.
 
-        The values can be averaged over sub-frames: colours are linear light, and depth is multiplied by alpha. The
-        entry ``_COVERAGE`` is alpha. Layers that the model does not have are removed from ``present``.
+        Colours are linear light, and depth is multiplied by alpha, so that the values can be averaged over sub-frames.
+        The entry ``_COVERAGE`` is alpha. Layers that the model does not have are removed from ``present``.
         """
         small, settings = self.point.scale_view(view), self.point.settings
         found: dict[str, Tensor] = {}
@@ -361,7 +362,8 @@ def _linear_light_of_run_layer(image: Tensor, color_space: str, alpha: Tensor | 
     """Convert an (H, W, C) image from ``color_space`` to linear light; negative sRGB values become 0.
 
     Args:
-        alpha: (H, W), if the image is premultiplied by it. The transfer curve is applied to the unpremultiplied colour.
+        alpha: (H, W) alpha by which the image is premultiplied; None for an image that is not premultiplied. The
+            transfer curve is applied to the unpremultiplied colour.
     """
     if color_space == "linear":
         return image

@@ -44,8 +44,8 @@ SETS = ("orbit", "test")
 
 ANIMATIONS = ("webp", "gif", "mp4")
 FORMATS = ("png", "exr", "npy", *ANIMATIONS)
-"""Formats that ``neuprim render`` writes. EXR and npy hold all channels unchanged; the others hold the displayed
-image."""
+"""Formats that ``neuprim render`` writes. npy holds all channels unchanged, and EXR holds all channels as linear
+light. The other formats hold the displayed image."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ class RenderRequest:
         overrides: render settings, see :class:`~neuprim.runs.render_config.RenderConfig`.
         layers: layers of an OpenEXR file, separated by commas; None for all layers except those of single lights.
         datatype: type of alpha and layers of light in OpenEXR files: "half" (16 bits) or "float" (32 bits, default).
-        space: coordinates of cameras in files, lights and depths: "world" (those of the data's files) or "scene" (those
-            of the model).
+        space: coordinates of cameras in files, lights and depths: "world" (coordinates of the data's files) or "scene"
+            (coordinates of the model).
         overwrite: whether to replace pictures of the run's report.
         frame: numbers of source frames to render, e.g. "1001-1048x2", for volumes; they replace the condition "time"
             and appear in file names.
@@ -205,7 +205,7 @@ class _RunRenderSession:
         return illumination
 
     def _load_views(self) -> tuple[list[View], float | None]:
-        """Return the views to render, in the model's coordinates, and the frames per second, None if not stated."""
+        """Return the views to render, in the model's coordinates, and the frames per second; None if not stated."""
         request, fps = self.request, self.request.fps
         if request.camera not in SETS:
             file = read_camera_file(Path(request.camera), request.size)
@@ -232,8 +232,8 @@ class _RunRenderSession:
     def _choose_frames(self) -> tuple[list[int], Mapping[str, str]]:
         """Return the source frame numbers that ``--frame`` names, and the texts of options such as ``--time``.
 
-        With ``--frame``, the text of ``--time`` lists the times of these frames. Without it, return no numbers and the
-        texts as the user gave them.
+        With ``--frame``, the text of ``--time`` lists the times of these frames. Without ``--frame``, return no
+        numbers, and the texts as the user gave them.
         """
         text, conditions = self.request.frame, self.request.conditions
         if text is None:
@@ -305,7 +305,7 @@ class _RunRenderSession:
     def _count_pass(self, alpha: Tensor) -> None:
         """Count a rendered image, note whether its ``alpha`` shows the model, and report the progress.
 
-        Images are one per view, sub-frame of motion blur and light.
+        There is one image for each view, sub-frame of motion blur and light.
         """
         each, count = max(len(self.lights), 1) * (self.shutter.samples if self.shutter else 1), len(self.views)
         self._visible |= bool((alpha > 0).any())
@@ -346,8 +346,8 @@ def set_run_view_conditions(
 ) -> tuple[list[View], bool]:
     """Return the views with the conditions (e.g. time) that the user typed, and whether a condition is animated.
 
-    All animated conditions advance together, frame by frame. If there are more frames than cameras, or the reverse,
-    the fewer ones are spread evenly over the others.
+    All animated conditions advance together, frame by frame. If there are fewer cameras than frames, cameras are
+    repeated evenly. If there are fewer frames than cameras, frames are repeated evenly.
 
     Raises:
         ConfigError: a view lacks a condition that the task needs, or a text is refused by

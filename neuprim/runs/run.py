@@ -54,7 +54,7 @@ _MIN_PRIMITIVES = 8
 
 
 class ChunksMissing(NeuprimError):
-    """Error of a run of which some chunks failed. The message says which and why. Finished chunks stay on disk."""
+    """Error: some chunks of a run failed. The message names these chunks and the reasons. Finished chunks stay."""
 
 
 def run(
@@ -72,8 +72,10 @@ def run(
     Args:
         config: the configuration.
         events: function that is called with every event.
-        between: function (training, event) to call between steps. If it sets the event, the run stops as by Ctrl-C.
-        group: processes that train this model together. Each of them calls this function; the first one writes files.
+        between: function (training, event) to call between steps. If the function sets the event, the run
+            stops as by Ctrl-C.
+        group: processes that train this model together. Each process calls this function; the first process writes
+            files.
         launcher: where to train the chunks, if the scene is trained in chunks.
 
     Raises:
@@ -192,14 +194,14 @@ def train_in_chunks(
     """Train the chunks (parts of a scene) of ``scene.chunks``, join their models, and train the joined model.
 
     If the scene decides against chunks, train it as one run. Finished chunks are not repeated: the same command with
-    ``resume=true`` trains the missing ones. Return the trained model, and whether Ctrl-C ended the training.
+    ``resume=true`` trains the missing chunks. Return the trained model, and whether Ctrl-C ended the training.
 
     Args:
         launcher: where chunks are trained and their ground truth is rendered. This process trains the joined model.
 
     Raises:
-        ChunksMissing: some chunks failed; the others were completed.
-        KeyboardInterrupt: Ctrl-C came before all chunks were done; unfinished ones have checkpoints.
+        ChunksMissing: some chunks failed; the other chunks were completed.
+        KeyboardInterrupt: Ctrl-C came before all chunks were done; unfinished chunks have checkpoints.
         NeuprimError: an error of a run, the launcher cannot work here, or the chunks differ from those of the
         interrupted run.
     """

@@ -1,7 +1,7 @@
 """Motion blur: an image is the mean of sub-frames, renderings at times spread over the interval of an open shutter.
 
 The shutter is centred on the frame, as in Blender and Arnold: it opens before the time of the frame and closes after
-it. The camera and the lights of an image do not move while the shutter is open.
+this time. The camera and the lights of an image do not move while the shutter is open.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Shutter:
         fraction: part of the interval between two frames, above 0 and at most 1.
         samples: number of sub-frames of an image.
         interval: time between two frames, in units of the condition "time".
-        limits: first and last time of the sequence; earlier and later times are clamped to them.
+        limits: first and last time of the sequence; times outside are clamped to this range.
     """
 
     fraction: float
@@ -69,13 +69,16 @@ def choose_shutter(
         raise ConfigError(f"{where}: expected a part of the frame interval, above 0 and at most 1")
     interval = frame_interval(header, (float(view.conditions["time"]) for view in views))
     if interval is None:
-        found = "all images show one time, and the model has no numbered frames"
-        raise ConfigError(f"{where}: {found}; expected an interval between frames. Pass a range, as --time 0:1:48.")
+        found = "the frame interval is unknown: all images show one time, and the model has no numbered frames"
+        raise ConfigError(f"{where}: {found}; expected several times. Pass a range, such as --time 0:1:48.")
     return Shutter(fraction, samples, interval, time.range)
 
 
 def mean_in_linear_light(images: Iterable[Tensor], color_space: str) -> Tensor:
-    """Average (H, W, C) images in linear light; images and mean have ``color_space``. Negative sRGB values become 0."""
+    """Return the mean of (H, W, C) images, averaged in linear light.
+
+    Images and mean have the colour space ``color_space``, "linear" or "srgb". Negative sRGB values become 0.
+    """
     if color_space == "linear":
         return torch.stack(list(images)).mean(0)
     return linear_to_srgb(torch.stack([srgb_to_linear(image.clamp_min(0.0)) for image in images]).mean(0))

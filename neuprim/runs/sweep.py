@@ -107,8 +107,8 @@ class LaunchRecord:
         old, names = {run.name: run for run in before.runs}, [run.name for run in self.runs]
         if not more and list(old) != names:
             raise ConfigError(
-                f"{self.file}: contains the runs {', '.join(old)}; the settings now give {', '.join(names)}; expected "
-                f"the same settings, or another --out DIR"
+                f"{self.file}: contains the runs {', '.join(old)}, but the settings now give {', '.join(names)}; "
+                f"expected the same settings, or another --out DIR"
             )
         for run in self.runs:
             if run.name in old and old[run.name].words != run.words:
@@ -219,7 +219,7 @@ def read_sweep_overrides(words: Sequence[str]) -> list[str]:
         before = read_launch_record(Path(str(given["output_dir"])).expanduser() / SWEEP_FILE)
     if before is None:
         raise ConfigError(
-            f"{' '.join(words) or 'nothing'}: no values to sweep; expected KEY=A,B,C, or resume=true with "
+            f"{' '.join(words) or '-m'}: no values to sweep; expected KEY=A,B,C, or resume=true with "
             f"--out DIR of a sweep (it contains {SWEEP_FILE})"
         )
     for word in before.words:
@@ -272,7 +272,7 @@ def run_sweep(
 ) -> tuple[LaunchRecord, list[JobResult | None]]:
     """Train all configurations of a sweep, each in its own directory, and write the page that compares them.
 
-    With ``resume``, finished runs are not repeated and unfinished ones continue. A failed run does not stop the others.
+    With ``resume``, finished runs are not repeated, and unfinished runs continue. A failed run stops no other run.
 
     Args:
         configs: configurations of :func:`~neuprim.config.compose_all`, all in one directory.

@@ -1,6 +1,6 @@
 """Train in a run directory, resume from its checkpoint, and fine-tune a changed model.
 
-Fine-tuning trains a changed model, e.g. a pruned one, with schedules like those of the last part of a run's training.
+Fine-tuning trains a changed model, e.g. a pruned one, with schedules similar to the last part of a run's training.
 The number of primitives is fixed.
 """
 
@@ -62,13 +62,13 @@ BEGIN = 0.8
 
 START, COOL = 3.0, 0.02
 """Learning rates of fine-tuning. START is the rate of the first step divided by the final rate of the run; COOL is the
-rate of the last step divided by that of the first. Rates near zero at the end let the parameters settle. This improves
-quality by itself, and matters most where parameters are rounded."""
+rate of the last step divided by the rate of the first step. Rates near zero at the end let the parameters converge,
+which improves quality, most of all where parameters are rounded."""
 
 LONG, LEAST_START = 2000, 1.0
-"""LONG is the least number of fine-tuning steps with which the learning rates begin at :data:`START`. With fewer steps
-they begin proportionally lower, but not below LEAST_START: a few hundred steps at high rates degrade a well trained
-volume."""
+"""LONG is the least number of fine-tuning steps with which the learning rates begin at :data:`START`. With fewer steps,
+the learning rates begin proportionally lower, but not below LEAST_START, because a few hundred steps at high rates
+degrade a well trained volume."""
 
 VOXELS_EVERY = 8
 """Largest interval, in fine-tuning steps, between two steps that also use voxels (known extinction), if the run used
@@ -79,8 +79,9 @@ _PACE_WARMUP, _PACE_STEPS = 5, 20
 """Number of warm-up steps, and of timed steps after them, to measure the time per fine-tuning step."""
 
 BetweenSteps = Callable[[Fitted, threading.Event], None]
-"""Callback on the training thread, before the first step and after every step. Its arguments are the training and
-an event that ends the training like Ctrl-C. It may read and save the state, and wait, but must not change the state."""
+"""Callback on the training thread, before the first step and after every step. The arguments are the training
+and an event that ends the training like Ctrl-C. The callback may read and save the state, and wait,
+but must not change the state."""
 
 
 def train_in_directory(
@@ -134,7 +135,8 @@ def _resume_training(fitted: Fitted, events: Events) -> None:
         return
     header, tensors = checkpoint.read_tensors(saved, "checkpoint")
     if header.get("task") != config.task:
-        raise CheckpointError(f"{saved}: written for task {header.get('task')!r}; this run's task is {config.task!r}")
+        found = f"written for task {header.get('task')!r}"
+        raise CheckpointError(f"{saved}: {found}, but this run's task is {config.task!r}")
     check_resumed_provenance(header.get("made_by"), config.made_by, saved)
     fitted.trainer.load_state(tensors, header, str(saved))
     was, now = World.of(header, str(saved)), fitted.dataset.world
@@ -292,7 +294,7 @@ def make_run_finetune_trainer(
 ) -> Trainer:
     """Return a trainer that fine-tunes a copy of a finished run's model for ``steps`` steps.
 
-    Schedules are those of the run from progress ``begin`` to 1, except for the learning rates (:data:`START`,
+    The trainer uses the run's schedules from progress ``begin`` to 1, except for the learning rates (:data:`START`,
     :data:`COOL`). The number of primitives is fixed, and steps render whole views. If the run has a checkpoint, the
     trained exposures and camera corrections of its views are loaded from it. ``voxels_every`` is the largest interval
     between steps with voxels (:data:`VOXELS_EVERY`).

@@ -40,7 +40,10 @@ def hash_scene_settings(settings: Any, version: int) -> str:
 
 
 def scene_direction(cosine: float, azimuth: float) -> NDArray[np.float64]:
-    """Return the (3,) unit vector with zenith cosine ``cosine`` and ``azimuth``, radians from x towards y."""
+    """Return a (3,) unit vector; the angle between the vector and the z axis has this ``cosine``.
+
+    ``azimuth`` is the angle of the vector about the z axis, in radians from x towards y.
+    """
     across = math.sqrt(max(1.0 - cosine * cosine, 0.0))
     return np.array([across * math.cos(azimuth), across * math.sin(azimuth), cosine])
 
@@ -78,7 +81,10 @@ def average_scene_rays(values: NDArray[np.float32], size: int, samples: int) -> 
 
 
 def draw_in_parallel(work: Callable[[T], object], jobs: Sequence[T], progress: Callable[[float], None]) -> None:
-    """Call ``work`` with each job, in threads. ``progress`` gets the fraction done; an error cancels the rest."""
+    """Call ``work`` with each job, in threads. ``progress`` gets the fraction done.
+
+    After an error, jobs that have not started are cancelled.
+    """
     pool = ThreadPoolExecutor(min(_MAX_THREADS, os.cpu_count() or 1))
     try:
         for done, _ in enumerate(pool.map(work, jobs), start=1):
@@ -94,9 +100,9 @@ def scene_drawing_text(name: str, scene: Scene, width: int, height: int) -> str:
 
 
 def write_scene_folder(final: Path, files: Iterable[str], write: Callable[[Path], None], what: str) -> Path:
-    """Create the folder ``final``, unless it has all ``files``, and return it.
+    """Create the folder ``final``, unless it already contains all ``files``; return the folder.
 
-    ``write`` fills a temporary folder, which is then renamed. ``what`` begins the message of a DataError.
+    ``write`` fills a temporary folder, which is then renamed to ``final``. ``what`` begins the message of a DataError.
     """
     names = tuple(files)
     try:
@@ -108,13 +114,13 @@ def write_scene_folder(final: Path, files: Iterable[str], write: Callable[[Path]
 
 @dataclass(frozen=True)
 class SceneImageSet(Generic[V]):
-    """Image set of a generated scene: ``transforms_SPLIT.json`` and ``SPLIT/...``. ``V`` is the type of a view."""
+    """Image set of a generated scene: files ``transforms_SPLIT.json`` and folders ``SPLIT``. ``V``: type of a view."""
 
     name: str
     key: str  # hash of everything the files depend on
-    size: int  # width and height in pixels, for messages
+    size: int  # width and height of the images in pixels, for messages
     splits: Mapping[str, Sequence[V]]  # views of each split, in order
-    lens: Mapping[str, float]  # fields of a transforms file before its frames
+    lens: Mapping[str, float]  # camera fields at the start of each transforms file
     build: Callable[[], Scene]
     frame: Callable[[str, V], Mapping[str, Any]]  # (split, view) -> entry in the transforms file
     files: Callable[[V], Sequence[str]]  # view -> names of its files in the folder of its split
@@ -123,7 +129,7 @@ class SceneImageSet(Generic[V]):
     facts: Callable[[Any], Mapping[str, Any]] = lambda scene: {}  # scene -> further fields of a transforms file
 
     def generate(self, cache_dir: Path, progress: Progress) -> Path:
-        """Write the image set unless it exists completely; return its folder ``cache_dir/NAME-KEY``."""
+        """Write the image set unless all its files exist; return the folder ``cache_dir/NAME-KEY``."""
         names = [f"transforms_{split}.json" for split in self.splits]
         names += [f"{split}/{file}" for split, views in self.splits.items() for v in views for file in self.files(v)]
         folder = Path(cache_dir) / f"{self.name}-{self.key}"

@@ -1,13 +1,13 @@
 """Generator of the scene ``lit_solids``: solids under one point light per image, in the file layout of GS³.
 
     transforms_{train,test,circle}.json    camera_angle_x, poses with OpenGL axes, pl_pos, pl_intensity
-    train/r_0000.exr                 RGBA, linear radiance over the exposure, premultiplied, half floats
+    train/r_0000.exr                 RGBA, linear radiance divided by the exposure, premultiplied, half floats
     train/r_0000_unshadowed.exr      the same image without cast shadows
     train/r_0000_classes.png         8-bit grey, index into :data:`neuprim.scenes.PIXEL_CLASSES`
     test/new_light_03_nearest.exr    test views only: the same view, lit by the nearest of 25 training lights
 
-A pixel's class is background if fewer than half of its rays hit a surface. Otherwise, if more than half of the rays
-that hit have the same class, the pixel has that class; if not, it is "lit". The light has the intensity
+A pixel's class is "background" if fewer than half of its rays hit a surface. Otherwise, the pixel has the class of more
+than half of the rays that hit a surface; if there is no such class, the pixel is "lit". The light has the intensity
 :data:`INTENSITY` in every image. Scene, cameras and lights do not depend on a seed: equal settings give equal files.
 """
 
@@ -51,11 +51,12 @@ FIELD_OF_VIEW = 2 * float(np.arcsin(1.19 / DISTANCE[0]))
 """Field of view, radians. The nearest camera sees the whole sphere of radius 1.19 around the origin."""
 
 INTENSITY = 69.2
-"""Radiant intensity of the lights divided by the exposure. With default settings, the 99.5th percentile of the training
-images is 1."""
+"""Radiant intensity of the lights divided by the exposure. The value is chosen so that the 99.5th percentile of the
+training images is 1 with default settings."""
 
 PARTS = ("new_view", "new_light", "new_both")
-"""Parts of the test split: new camera with a training light, training camera with a new light, and both new."""
+"""Parts of the test split: new camera with a training light, training camera with a new light, new camera with a new
+light."""
 
 NEAR_LIGHTS = 25  # the baseline "nearest light" knows the lights of this many training images, the first ones
 
@@ -63,7 +64,7 @@ CIRCLE_FRAMES = 36
 _CAMERA_POLAR, _LIGHT_POLAR = math.radians(75.0), math.radians(60.0)
 
 _BRIGHT = 0.5 / (np.pi * (sum(DISTANCE) / 2) ** 2)
-"""Least radiance of highlights for the pixel class "highlight", divided by the light's intensity, 1/length^2."""
+"""Least radiance of a highlight in the pixel class "highlight", divided by the light's intensity, 1/length^2."""
 
 _LIT, _CAST, _ATTACHED, _HIGHLIGHT = map(PIXEL_CLASSES.index, ("lit", "cast_shadow", "attached_shadow", "highlight"))
 
@@ -97,9 +98,10 @@ class LitView(NamedTuple):
 
 
 class LitImage(NamedTuple):
-    """Image of ``lit_solids``: radiance, radiance without cast shadows, both (H, W, 4) with premultiplied alpha.
+    """Image of ``lit_solids``: linear radiance, radiance without cast shadows, and the class of each pixel.
 
-    ``classes`` (H, W) are indices into :data:`neuprim.scenes.PIXEL_CLASSES`.
+    ``rgba`` and ``unshadowed`` are (H, W, 4) with premultiplied alpha. ``classes`` (H, W) has indices into
+    :data:`neuprim.scenes.PIXEL_CLASSES`.
     """
 
     rgba: NDArray[np.float32]
@@ -156,10 +158,10 @@ def _lit_frame_entry(split: str, view: LitView) -> dict[str, Any]:
 def place_cameras_and_lights(train_views: int, test_views: int) -> dict[str, list[LitView]]:
     """Return the views of ``lit_solids`` by split: "train", "test", "circle".
 
-    Cameras look at the origin from a distance of 4 to 5 scene units, at most 75 degrees from the zenith. Lights have
-    a distance of 4 to 5, too, at most 60 degrees from the zenith. Directions are uniform on the spherical cap, and
-    distances are uniform. The test split has three :data:`PARTS` of equal size. "circle" is a video from one new
-    camera, with a light that goes around the solids once.
+    Cameras face the origin. Cameras and lights are 4 to 5 scene units from the origin: cameras at most 75 degrees from
+    the zenith, lights at most 60 degrees. Directions are uniform on the spherical cap, and distances are uniform. The
+    test split has three :data:`PARTS`, whose sizes differ by one view at most. "circle" is a video from one new camera,
+    with a light that goes around the solids once.
     """
     digits = max(4, len(str(train_views)))
     cameras, lights = _draw_lit_positions(1, train_views)
@@ -187,7 +189,7 @@ def place_cameras_and_lights(train_views: int, test_views: int) -> dict[str, lis
 
 
 def _draw_lit_positions(key: int, count: int) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
-    """Draw random positions of ``count`` cameras and lights, seeded by ``key``. A larger ``count`` only adds some."""
+    """Draw random positions of ``count`` cameras and lights, seeded by ``key``. A larger ``count`` only adds more."""
     numbers = np.random.default_rng([20241208, key]).random((count, 6))
     return [_position_above_lit_solids(n[:3], _CAMERA_POLAR) for n in numbers], [
         _position_above_lit_solids(n[3:], _LIGHT_POLAR) for n in numbers
@@ -195,7 +197,10 @@ def _draw_lit_positions(key: int, count: int) -> tuple[list[NDArray[np.float64]]
 
 
 def _position_above_lit_solids(numbers: NDArray[np.float64], polar: float) -> NDArray[np.float64]:
-    """Map three numbers 0..1 to a position (3,); its direction is uniform within ``polar`` radians of the zenith."""
+    """Map three numbers 0..1 to a position (3,) whose direction is within ``polar`` radians of the zenith.
+
+    Uniform random numbers give directions that are uniform on the spherical cap.
+    """
     cosine = 1.0 - numbers[0] * (1.0 - math.cos(polar))
     return (DISTANCE[0] + numbers[2] * (DISTANCE[1] - DISTANCE[0])) * scene_direction(cosine, 2 * math.pi * numbers[1])
 
@@ -204,9 +209,10 @@ def _position_above_lit_solids(numbers: NDArray[np.float64], polar: float) -> ND
 
 
 def build_lit_solids() -> list[Solid]:
-    """Build the bodies of the scene ``lit_solids``: those of the scene ``solids`` without the plate, and two more.
+    """Build the bodies of the scene ``lit_solids``: a slab, a ring, and the bodies of the scene ``solids``.
 
-    The two are a bright slab, on which shadows are visible, and a dark ring with highlights.
+    The plate of the scene ``solids`` is left out. The slab is bright, so that shadows on it are visible. The ring is
+    dark and has highlights.
     """
     thick, edge, major, minor = 0.1, 0.012, 0.235, 0.1
     profile = [(0.0, 1.0 - edge), (edge, 1.0), (thick - edge, 1.0), (thick, 1.0 - edge)]
@@ -252,9 +258,10 @@ def shade_point_light(
 ) -> ShadedRays:
     """Cast N rays and shade them under one point light at ``light`` (3,).
 
-    Radiance is (albedo / pi + highlight) * cos(incidence) * intensity / distance^2, or 0 in shadow. Pixel classes:
-    "highlight" if the highlight is brighter than the diffuse part and than :data:`_BRIGHT`, "attached_shadow" if the
-    surface faces away from the light, "cast_shadow" if another surface occludes the light.
+    Radiance is (albedo / pi + highlight) * cos(incidence) * intensity / distance^2, or 0 in shadow; the highlight is
+    the Blinn-Phong term of :mod:`neuprim.scenes.shading`. The class of a ray is "attached_shadow" if the surface faces
+    away from the light, "cast_shadow" if another surface occludes the light, "highlight" if the highlight is brighter
+    than the diffuse part and than :data:`_BRIGHT`, and "lit" otherwise. A ray without a hit is "background".
     """
     d = np.asarray(directions, dtype=np.float32)
     hits = scene.intersect(origins, d)

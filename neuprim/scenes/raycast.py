@@ -29,14 +29,14 @@ class Hits:
     hit: NDArray[np.bool_]  # (N,) bool
     position: NDArray[np.float32]  # (M, 3) float32, scene units
     distance: NDArray[np.float32]  # (M,) float32, in lengths of the ray direction
-    # normal, face: (M, 3) float32 unit normals: for shading, and of the triangle
+    # normal, face: (M, 3) float32 unit normals: the interpolated normal for shading, and the normal of the triangle
     normal: NDArray[np.float32]
     face: NDArray[np.float32]
     albedo: NDArray[np.float32]  # (M, 3) float32 linear RGB
     # gloss, specular: (M,) float32, see :class:`~neuprim.scenes.shapes.Solid`
     gloss: NDArray[np.float32]
     specular: NDArray[np.float32]
-    # solid, triangle: (M,) indices of the solid, and among the faces of all solids
+    # solid, triangle: (M,) index of the solid that is hit, and index of the triangle among the faces of all solids
     solid: NDArray[np.intp]
     triangle: NDArray[np.integer]
     weight: NDArray[np.float32]  # (M, 3) float32 barycentric coordinates
@@ -48,9 +48,9 @@ class Hits:
 
 
 class Scene:
-    """A set of solids for ray queries. Queries change nothing, so threads may share a scene.
+    """A set of solids for ray queries. Queries do not change the scene, so threads may share a scene.
 
-    ``engine`` is "embree" or "numba"; "auto" takes Embree if it is installed.
+    ``engine`` is "embree" or "numba". "auto" chooses Embree if the package embreex is installed, else numba.
     """
 
     def __init__(self, solids: Sequence[Solid], engine: Engine = "auto") -> None:
@@ -89,15 +89,15 @@ class Scene:
     def _first_hits(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Return the first hits of N rays with origins ``o`` and directions ``d``, both (N, 3), as four (N,) arrays.
 
-        They are the triangle's index or -1, barycentric u and v, and the distance in lengths of ``d``.
+        The arrays are the triangle's index (-1 without a hit), barycentric u and v, and distance in lengths of ``d``.
         """
         return self._search.first(o, d)
 
     def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
         """Return (N,) bool: whether a surface lies on the segment from each point along its direction.
 
-        The segment ends at ``distance``, in lengths of the direction. Points must not lie on a surface: use
-        :meth:`Hits.lifted`.
+        The segment ends at ``distance``, in lengths of the direction. Points must not lie on a surface, because that
+        surface might count: use :meth:`Hits.lifted`.
         """
         o, d = _broadcast_raycast_rays(points, directions)
         return self._search.any(o, d, np.broadcast_to(np.asarray(distance, dtype=np.float32), len(o)))
@@ -147,7 +147,7 @@ class _EmbreeEngine:
 class _BoxHierarchy:
     """Bounding volume hierarchy of F triangles with vertices (V, 3) and indices (F, 3).
 
-    It has the same methods as :class:`_EmbreeEngine`.
+    The methods are the same as those of :class:`_EmbreeEngine`.
     """
 
     def __init__(self, vertices: NDArray, faces: NDArray) -> None:
@@ -199,9 +199,10 @@ def _build_box_tree(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray, NDAr
 
 @numba.njit(nogil=True, error_model="numpy")
 def _raycast_box_entry(low, high, node, o, inverse, limit):  # type: ignore[no-untyped-def]
-    """Return the distance at which a ray from ``o`` enters a node's box, or infinity if it does not before ``limit``.
+    """Return the distance at which a ray from ``o`` enters a node's box.
 
-    ``inverse`` is 1 / direction of the ray, per axis.
+    The distance is infinite if the ray misses the box or enters the box beyond the distance ``limit``. ``inverse`` is
+    1 / direction of the ray, per axis.
     """
     near, far = 0.0, limit
     for axis in range(3):
@@ -215,7 +216,7 @@ def _raycast_box_entry(low, high, node, o, inverse, limit):  # type: ignore[no-u
 
 @numba.njit(nogil=True, error_model="numpy")
 def _intersect_triangle(corner, o, d):  # type: ignore[no-untyped-def]
-    """Intersect the ray ``o`` + t ``d`` with a triangle (3, 3); return barycentric u, v, and t, or -1 without a hit."""
+    """Intersect the ray ``o`` + t ``d`` with a triangle (3, 3); return barycentric u, v, and t (t = -1: no hit)."""
     ex, ey, ez = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
     fx, fy, fz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
     px, py, pz = d[1] * fz - d[2] * fy, d[2] * fx - d[0] * fz, d[0] * fy - d[1] * fx

@@ -1,8 +1,8 @@
 """Generator of the scene ``room``: simulated photographs from a walk around the solids, with lens distortion.
 
 transforms.json, images/...    layout of nerfstudio, with OpenCV's lens distortion and a train/test split
-points.ply                     simulated structure from motion: points where there is detail, a few of them wrong
-exposures.json                 image -> the exposure factor by which its linear values are multiplied
+points.ply                     simulated structure from motion: points where images have detail; a few points are wrong
+exposures.json                 image -> exposure factor that multiplies the linear values of the image
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ class RoomSettings:
     train_views: Annotated[int, Range(2, 10000)] = 80
     test_views: Annotated[int, Range(1, 10000)] = 20
     supersampling: Supersampling = 2  # rays per pixel along each axis
-    exposure: Annotated[float, Range(0, 2)] = 0.15  # stops by which training images are brighter or darker at most
-    points: Annotated[int, Range(1, 1000000)] = 3000  # how many points a reconstruction has found
-    distortion: bool = True  # whether the lens bends the images
+    exposure: Annotated[float, Range(0, 2)] = 0.15  # largest change of a training image's exposure, in stops
+    points: Annotated[int, Range(1, 1000000)] = 3000  # number of points of the simulated reconstruction
+    distortion: bool = True  # whether the lens distorts the images
 
     def __post_init__(self) -> None:
         validate_fields(self, "scene")
@@ -94,7 +94,7 @@ def generate_room(settings: RoomSettings, cache_dir: Path, progress: Progress = 
 
 
 def build_room(settings: RoomSettings) -> Room:
-    """Build the scene ``room``, with textures filtered for the ray spacing of the images."""
+    """Build the scene ``room``; its textures are filtered for the distance between neighbouring rays of the images."""
     return Room(build_solids(), furnish_room(), 1 / (room_lens(settings).focal * settings.supersampling))
 
 
@@ -156,7 +156,7 @@ def _room_transforms_document(lens: RoomLens, shots: list[_Shot]) -> dict[str, A
 
 @dataclass(frozen=True)
 class RoomLens:
-    """Camera intrinsics for images ``width`` pixels wide. With all-zero ``distortion``, the camera is a pinhole."""
+    """Camera intrinsics for images ``width`` pixels wide. If ``distortion`` is all zero, the camera is a pinhole."""
 
     width: int
     distortion: RadialDistortion = LENS
@@ -203,9 +203,9 @@ class RoomLens:
         return points
 
     def ray_bands(self, pose: NDArray[np.float64], samples: int) -> Iterator[NDArray[np.float64]]:
-        """Yield (N, 3) unit ray directions, a band of pixel rows at a time; ``samples`` x ``samples`` per pixel.
+        """Yield (N, 3) unit ray directions of the image, a band of pixel rows at a time.
 
-        ``pose`` (4, 4) is camera to world.
+        Each pixel has ``samples`` x ``samples`` rays. ``pose`` (4, 4) is camera to world.
         """
         across = (np.arange(self.width * samples) + 0.5) / samples
         down = (np.arange(self.height * samples) + 0.5) / samples
@@ -236,9 +236,9 @@ def photograph_room(
 
 
 def room_walk_positions(train: int, test: int) -> dict[str, NDArray[np.float64]]:
-    """Return {"train": (train,), "test": (test,)}: the positions of the views along the camera's walk, 0..1.
+    """Return the positions of the views along the camera's walk, 0..1: {"train": (train,), "test": (test,)}.
 
-    Test views are evenly spaced, and training views lie between them.
+    Test views are evenly spaced, and training views lie between the test views.
     """
     held_out = (np.arange(test) + 0.5) / test
     gap = np.arange(train) * test // train
@@ -281,12 +281,12 @@ def _walk_pose(t: float, shake: NDArray[np.float64]) -> NDArray[np.float64]:
 class ReconstructedPoints(NamedTuple):
     """N points of a simulated structure-from-motion reconstruction."""
 
-    # surface, position: (N, 3) float64 true positions, and positions according to the reconstruction
+    # surface, position: (N, 3) float64, true positions, and positions with the errors of the reconstruction
     surface: NDArray[np.float64]
     position: NDArray[np.float64]
-    # (N, 3) uint8 sRGB of the surface as its camera sees it, without the photograph's own exposure
+    # (N, 3) uint8 sRGB colour of the surface as seen by ``camera``, without the exposure factor of that camera's image
     rgb: NDArray[np.uint8]
-    camera: NDArray[np.intp]  # (N,) index of the training camera that found them
+    camera: NDArray[np.intp]  # (N,) index of the training camera that found the point
 
 
 def reconstruct_room_points(
@@ -336,7 +336,7 @@ def reconstruct_room_points(
 
 
 def _room_pixel_detail_chances(luma: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the (H * W,) cumulative probabilities with which pixels are drawn; brightness gradients increase them."""
+    """Return (H * W,) cumulative probabilities for drawing pixels: pixels with brightness gradients are more likely."""
     down, across = np.gradient(luma.astype(np.float64))
     detail = np.hypot(down, across)
     total = np.cumsum((detail + _PLAIN * max(detail.mean(), 1e-6)).ravel())
@@ -346,7 +346,7 @@ def _room_pixel_detail_chances(luma: NDArray[np.float32]) -> NDArray[np.float64]
 def _room_seen_by_another(
     room: Room, lens: RoomLens, poses: Sequence[NDArray[np.float64]], camera: int, directions: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return (M,) bool: whether the surface point along each direction from ``camera`` is visible in another image."""
+    """Return (M,) bool: whether the surface hit by each ray from ``camera`` is visible in another camera's image."""
     hits = room.intersect(poses[camera][:3, 3], directions)
     starts = hits.lifted()
     seen = np.zeros(len(starts), dtype=np.bool_)
@@ -373,7 +373,8 @@ _GRAZING = np.float32(0.04)  # least cosine of the angle of incidence in the wid
 class Room(Scene):
     """Scene of solids and furnishings. Textures are averaged over the footprints of rays, which prevents aliasing.
 
-    ``spacing`` is the distance between neighbouring rays at distance 1 from the camera.
+    A footprint is the area of the surface that one ray represents. ``spacing`` is the distance between neighbouring
+    rays at distance 1 from the camera.
     """
 
     def __init__(

@@ -47,7 +47,7 @@ def lattice_noise(points: Array, width: Array, cell: float, seed: int, octaves: 
     """Return (M,) smooth noise at ``points`` (M, D), about -1..1, with mean 0.
 
     The noise is a sum of octaves with lattice edges ``cell``, ``cell``/2, ... Each octave has ``fall`` times the
-    amplitude of the one before. Octaves whose lattice edge is smaller than about ``width`` (M,) are left out.
+    amplitude of the octave before. Octaves whose lattice edge is smaller than about ``width`` (M,) are left out.
     """
     total, strength = np.zeros(len(points), dtype=np.float32), 1.0
     for octave in range(octaves):
@@ -112,7 +112,10 @@ def speckled(code: str, seed: int, strength: float = 0.12, cell: float = 0.5) ->
 def planks(
     dark: str, light: str, along: int, across: int, seed: int, width: float = 0.3, length: float = 2.2
 ) -> Texture:
-    """Return a texture of wooden boards with grain and gaps; ``along`` and ``across`` are the indices of their axes."""
+    """Return a texture of wooden boards with grain and gaps.
+
+    ``along`` and ``across`` are the indices of the axes along the boards and across the boards.
+    """
     one, other = parse_solid_srgb(dark), parse_solid_srgb(light)
 
     def texture(p: Array, w: Array) -> Array:
@@ -162,7 +165,7 @@ def chequered(one: str, other: str, u: int, v: int, cell: float, seed: int) -> T
 
 
 def wallpaper(u: int, v: int, seed: int) -> Texture:
-    """Return a wallpaper texture: broad and narrow stripes, with a row of dots in every broad one."""
+    """Return a wallpaper texture: broad and narrow stripes, with a row of dots in every broad stripe."""
     ground, broad, narrow, dot = map(parse_solid_srgb, ("#e9dcc0", "#9db8a2", "#4f7a6b", "#b5533c"))
 
     def texture(p: Array, w: Array) -> Array:
@@ -245,7 +248,7 @@ def marble(seed: int) -> Texture:
 
 
 def rug(radius: float, seed: int) -> Texture:
-    """Return the texture of a woven rug: rings about the z axis, some of them divided into wedges."""
+    """Return the texture of a woven rug: rings about the z axis; some rings are divided into wedges."""
     red, navy, cream = parse_solid_srgb("#a63a3a"), parse_solid_srgb("#1f2f4f"), parse_solid_srgb("#e8dcc2")
 
     def texture(p: Array, w: Array) -> Array:
@@ -286,7 +289,7 @@ _UP = [0, 0, 1]
 
 
 class Furnishing(NamedTuple):
-    """A closed body in the room. If ``glow`` is above 0, it emits the colour of ``texture`` and reflects no light."""
+    """A closed body in the room. If ``glow`` is above 0, the body emits the texture's colour and reflects no light."""
 
     name: str
     mesh: trimesh.Trimesh

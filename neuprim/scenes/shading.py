@@ -2,7 +2,8 @@
 
 f = albedo / pi + k (n + 8) / (8 pi) (N.H)^n,     k = specular gloss,  n = 6 + 110 gloss^2,
 
-where N is the surface normal and H the half vector between the directions to the eye and to the light.
+where N is the surface normal and H the half vector between the directions to the eye and to the light. The factors
+``specular`` and ``gloss`` are members of :class:`~neuprim.scenes.shapes.Solid`.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ class Daylight:
     """Sun and sky that light a generated scene."""
 
     direction: tuple[float, float, float] = (0.42, -0.62, 0.92)  # (3,) towards the sun; any length
-    sun: Colour = (2.3, 2.2, 2.0)  # linear RGB irradiance of a surface facing it
+    sun: Colour = (2.3, 2.2, 2.0)  # linear RGB irradiance of a surface that faces the sun
     # sky, ground: linear RGB radiance from straight above and straight below, blended in between
     sky: Colour = (0.42, 0.46, 0.53)
     ground: Colour = (0.22, 0.2, 0.18)
@@ -40,7 +41,8 @@ def shading_dot(a: Array, b: Array) -> Array:
 def reflectance_lobes(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> tuple[Array, Array]:
     """Return two (M,) arrays for M surface hits: cosine of the angle between normal and light, and highlight.
 
-    The cosine is at least 0. The highlight is its reflectance times pi. ``to_eye``, ``to_light`` are unit vectors.
+    The cosine is clamped at 0 from below. The highlight is the second term of f (see the module) times pi.
+    ``to_eye`` and ``to_light`` are unit vectors.
     """
     eye, light = np.asarray(to_eye, dtype=np.float32), np.asarray(to_light, dtype=np.float32)
     cosine = np.maximum(shading_dot(hits.normal, light), 0)
@@ -54,7 +56,10 @@ def reflectance_lobes(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> tup
 
 
 def reflect_light(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> Array:
-    """Return the (M, 3) linear RGB radiance that M hits reflect, per unit irradiance of a surface facing the light."""
+    """Return the (M, 3) linear RGB radiance that M surface hits reflect from one light.
+
+    The light gives irradiance 1 to a surface that faces it.
+    """
     cosine, highlight = reflectance_lobes(hits, to_eye, to_light)
     return ((hits.albedo + highlight[:, None]) * (cosine / np.float32(np.pi))[:, None]).astype(np.float32)
 

@@ -17,7 +17,8 @@ Albedo = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 FLOOR = -0.52  # height of the plate's upper side, on which everything stands
 
 _CREASE = np.cos(np.radians(24.0))
-"""Cosine of the crease angle. Normals are smoothed across faces that meet at a smaller angle; chamfers stay hard."""
+"""Cosine of the crease angle. Normals are smoothed across faces that meet at a smaller angle, so chamfers (45 degrees)
+keep sharp edges."""
 
 _CORNERS_AT_ONCE = 1 << 18  # bounds the memory for pairs of corners
 
@@ -65,7 +66,10 @@ def rod(start: ArrayLike, end: ArrayLike, radius: float) -> trimesh.Trimesh:
 def lathe(
     start: ArrayLike, axis: ArrayLike, profile: Sequence[tuple[float, float]], sections: int = 96
 ) -> trimesh.Trimesh:
-    """Build a solid of revolution about ``axis``. ``profile`` lists (distance from ``start`` along it, radius)."""
+    """Build a solid of revolution about the axis through ``start`` with direction ``axis``.
+
+    ``profile`` lists (distance from ``start`` along the axis, radius).
+    """
     direction = np.asarray(axis, dtype=np.float64)
     direction = direction / np.linalg.norm(direction)
     side = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
@@ -85,10 +89,11 @@ def arc_tube(
     radii: ArrayLike,
     sections: int = 64,
 ) -> trimesh.Trimesh:
-    """Sweep a tube along a circular arc in the plane of ``first`` (angle 0) and ``second``.
+    """Sweep a tube along a circular arc about ``centre``, from direction ``first`` (angle 0) towards ``second``.
 
-    ``angles`` (n,) are ascending, radians. ``radii`` (n, 2) are the half axes of the elliptic cross-section, in the
-    arc's plane and across it; (n,) or one number for a round cross-section.
+    ``angles`` (n,) are the ascending angles of the cross-sections, radians. ``radii`` (n, 2) are half axes of elliptic
+    cross-sections, in the plane of the arc and perpendicular to the plane. For round cross-sections, ``radii`` is (n,)
+    or one number.
     """
     one, two = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     outward = np.cos(angles)[:, None] * one + np.sin(angles)[:, None] * two
@@ -123,7 +128,7 @@ def _tube_mesh(path: NDArray, side: NDArray, across: NDArray, half: NDArray, sec
 
 
 def merge_solid_meshes(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """Merge meshes into one. Touching meshes do not share vertices, so that each remains closed."""
+    """Merge meshes into one. Touching meshes do not share vertices, so that each mesh remains closed."""
     start = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     faces = [mesh.faces.view(np.ndarray) + first for mesh, first in zip(meshes, start[:-1], strict=True)]
     return trimesh.Trimesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces), process=False)
@@ -132,7 +137,8 @@ def merge_solid_meshes(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
 def solid_corner_normals(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
     """Return (F, 3, 3) unit normals at the corners of the F triangles, for smooth shading.
 
-    A normal is the mean over adjacent faces within the crease angle (24 degrees), weighted by their corner angles.
+    The normal of a corner is the mean of the normals of adjacent faces, weighted by the faces' corner angles. Faces
+    beyond the crease angle (24 degrees) are left out.
     """
     faces, flat = mesh.faces.view(np.ndarray), mesh.face_normals.view(np.ndarray)
     corners, angles = faces.size, mesh.face_angles.view(np.ndarray).ravel()
@@ -202,7 +208,7 @@ def build_solids() -> list[Solid]:
 
 
 def _place_solid(solid: Solid, pose: NDArray[np.float64]) -> Solid:
-    """Return the solid transformed by ``pose``, a (4, 4) similarity transform; its colour pattern moves with it."""
+    """Return the solid transformed by ``pose``, a (4, 4) similarity transform; the colour pattern moves along."""
     mesh = solid.mesh.copy()
     mesh.apply_transform(pose)
     back = np.linalg.inv(pose).astype(np.float32)

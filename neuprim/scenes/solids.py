@@ -84,7 +84,7 @@ def describe_solids_images(
 ) -> SceneImageSet[_SolidsView]:
     """Return the image set of the scene that ``build`` makes, with the cameras of ``scene=solids``.
 
-    ``seen`` shades rays. ``facts`` maps the scene to further fields of the transforms files.
+    ``seen`` is the function that shades rays. ``facts`` maps the scene to further fields of the transforms files.
     """
 
     def views(split: str, count: int) -> list[_SolidsView]:
@@ -111,7 +111,8 @@ def solids_camera_poses(split: str, count: int) -> list[NDArray[np.float64]]:
     """Return ``count`` camera-to-world matrices (4, 4), OpenGL axes, of cameras that face the origin from distance 4.
 
     The cameras of "train" are on an equal-area Fibonacci lattice, from 9 degrees below the horizon to 78 above. The
-    lattice of "test" turns the opposite way, from 3 to 64 degrees, so that its cameras fall between the training ones.
+    lattice of "test", from 3 to 64 degrees above, turns in the opposite direction, so that test cameras lie between
+    training cameras.
     """
     low, high, phase, turn = (-0.16, 0.98, 0.0, _GOLDEN_ANGLE) if split == "train" else (0.05, 0.9, 1.0, -_GOLDEN_ANGLE)
     cosines = [low + (high - low) * (i + 0.5) / count for i in range(count)]
@@ -125,7 +126,7 @@ def draw_solids(
 ) -> NDArray[np.uint8]:
     """Render an image, (size, size, 4) uint8 sRGB with straight alpha. ``pose`` (4, 4) is camera to world, OpenGL axes.
 
-    The rays of a pixel are averaged in premultiplied linear light; ``seen`` shades them.
+    The function ``seen`` shades the rays. The rays of a pixel are averaged in premultiplied linear light.
     """
     bands = []
     for directions in scene_ray_bands(pose, FIELD_OF_VIEW, size, supersampling):

@@ -1,8 +1,8 @@
 """Trade-offs of training settings: train a set of models, measure them together, and find the Pareto fronts.
 
-One model of the set, the *centre*, has the user's settings. The others differ from the centre in a single setting, or
-in a promising combination of settings. All models train for the same time. Running the same request again continues an
-earlier set.
+One model of the set, the *centre*, has the user's settings. The other models differ from the centre in a single
+setting, or in a promising combination of settings. All models train for the same time, except those that vary the
+training length. Running the same request again continues an earlier set.
 """
 
 from __future__ import annotations
@@ -64,12 +64,12 @@ TRIALS = "trials"  # folder of the models
 __all__ = ["run_ablation"]
 
 _PACES, _TRAINING = 0.2, 0.5
-"""Two fractions: of the time budget, for measuring the time per training step; of the rest, for training the models
-that change a single setting."""
+"""``_PACES``: fraction of the time budget for measuring the time per training step. ``_TRAINING``: fraction of the
+remaining budget for training the models that change a single setting."""
 
 _SINGLES, _TIMES, _COMBINED = 0.58, 0.64, 0.88
-"""Deadlines, as fractions of the time after planning: for training models with a single changed setting, for timing
-their frames, and for training models that combine changes."""
+"""Deadlines, as fractions of the time budget that is left after planning: for training models with a single changed
+setting, for timing their frames, and for training models that combine changes."""
 
 _MAX_COMBINATIONS = 12
 
@@ -87,7 +87,7 @@ def run_ablation(
 ) -> tuple[Path, TradeoffRecord]:
     """Train and measure models with varied settings; write ``tradeoff.json``, ``tradeoff.html`` and ``front.png``.
 
-    The same call with a larger budget adds models.
+    A second call with the same settings and a larger budget trains more models.
 
     Args:
         request: settings to vary, and the budget. ``request.words`` are overrides (``key=value``) of ``neuprim run``.
@@ -140,7 +140,7 @@ class _AblationSet:
     launcher: LauncherSettings
 
     def identity(self) -> dict[str, Any]:
-        """Return the facts that must be equal to continue an earlier set, as JSON-ready values."""
+        """Return the centre's settings as JSON-ready values. A set can only be continued with equal settings."""
         own = (*NOT_TRAINED_WITH, "made_by")
         settings = {name: value for name, value in self.centre.to_dict().items() if name not in own}
         return {"centre": settings}
@@ -177,13 +177,14 @@ class _AblationSession(TradeoffSession):
         return time.monotonic() - self.begun - self._compiling
 
     def seconds_left(self, part: float) -> float:
-        """Return the seconds left until the fraction ``part`` (0..1) of the time budget after planning is used."""
+        """Return the seconds until the fraction ``part`` (0..1) of the budget that was left after planning is used."""
         return self._planned_at + part * max(self.request.budget - self._planned_at, 0.0) - self.spent
 
     def run(self, wanted: Sequence[Variant]) -> None:
-        """Train the ``wanted`` models, which change one setting each, then models that combine changes.
+        """Train and time all models, find the Pareto fronts, and write the results.
 
-        Then find the Pareto fronts and write the results.
+        The ``wanted`` variants (the centre, and models that change one setting each) come first. Models that combine
+        changes follow.
         """
         with limit_process_threads(self._threads):  # as many threads as a training has
             wanted = self._measure_step_times(wanted)
@@ -234,9 +235,9 @@ class _AblationSession(TradeoffSession):
         return AblationStepTimes(self.centre, self._loaded[0])
 
     def _find_pace(self, variant: Variant, paces: dict[str, float]) -> str | None:
-        """Measure a variant's time per training step, divided by the centre's, and store it in ``paces``.
+        """Measure a variant's time per training step, and store it in ``paces``, divided by the centre's time per step.
 
-        Return why the variant cannot be trained; None if it can.
+        Return the reason if the variant cannot be trained, else None.
         """
         if not variant.turned:
             paces[variant.name] = 1.0
@@ -259,8 +260,8 @@ class _AblationSession(TradeoffSession):
     def _train(self, wanted: Sequence[Variant], part: float) -> None:
         """Train and measure the variants that are not in the record yet.
 
-        A variant is skipped if its training would end after the fraction ``part`` of the time after planning. The
-        centre (the model with the user's settings) and interrupted trainings are never skipped.
+        A variant is skipped if its training would end too late: after the fraction ``part`` of the budget that was left
+        after planning. The centre (the model with the user's settings) and interrupted trainings are never skipped.
         """
         known = {(point.turned, point.length) for point in self.record.points}
         todo = [variant for variant in wanted if (variant.turned, variant.length) not in known]
@@ -333,7 +334,7 @@ class _AblationSession(TradeoffSession):
             point.centre_ms = statistics.median(self.record.points[0].ms)
 
     def _combinations(self) -> list[Variant]:
-        """Return variants that combine several changes: those of earlier sessions, and new ones as time allows."""
+        """Return variants that combine changes: recorded combinations, and as many new combinations as time allows."""
         points = self.record.points
         allowed = [Variant(COMBINED, point.turned) for point in points if point.knob == COMBINED]
         rounds = self.seconds_left(_COMBINED) / max(self.plan.seconds, 1e-9)
@@ -375,8 +376,10 @@ def _check_ablation_folder(models: _AblationSet, before: TradeoffRecord | None) 
 def _resume_ablation_set(
     folder: Path, before: TradeoffRecord | None, identity: Mapping[str, Any], tell: Tell
 ) -> TradeoffRecord:
-    """Return the record to continue. It has the points (measured models) of the earlier record ``before``, if the facts
-    in ``identity`` (configuration, views, machine, versions) have not changed.
+    """Return the record with which the ablation continues.
+
+    The points (measured models) of the earlier record ``before`` are kept if the facts in ``identity`` (configuration,
+    views, machine, versions) have not changed.
     """
     record = TradeoffRecord(dict(identity))
     if before is None:

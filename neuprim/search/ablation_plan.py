@@ -31,7 +31,7 @@ _COUNTS, _LENGTHS = (0.5, 2.0, 0.25, 4.0, 1 / 8, 1 / 16, 1 / 32, 1 / 64), (0.5, 
 """Factors by which variants change the number of primitives, and the training length, of the user's model."""
 
 _MIN_LENGTH, _MIN_STEPS = 1 / 20, 100
-"""Least training of the user's model in an ablation: a fraction of the configured steps, or a number of steps if the
+"""Shortest training of the user's model in an ablation: a fraction of the configured steps, or a number of steps if the
 configured budget is in seconds."""
 
 _STEPS_PER_TURN, _TURNS = 4, 6  # step times: variant and centre alternate, so that load of the machine affects both
@@ -39,8 +39,9 @@ _STEPS_PER_TURN, _TURNS = 4, 6  # step times: variant and centre alternate, so t
 
 @dataclass(frozen=True)
 class Variant:
-    """A model to train in an ablation. ``knob`` is the name of the changed setting, and ``turned`` the overrides
-    (``key=value``) on top of the user's. ``length`` is the training length as a fraction of the full length.
+    """A model to train in an ablation. ``knob`` is the name of the changed setting. ``turned`` has the overrides
+    (``key=value``) that are added to the user's overrides. ``length`` is the training length as a fraction of the full
+    length.
     """
 
     knob: str
@@ -58,7 +59,7 @@ class Variant:
 
     @property
     def label(self) -> tuple[str, ...]:
-        """Overrides and training length as texts. They name the variant in the list of models without measurements."""
+        """Overrides and training length as texts. The record names variants that were not measured by these texts."""
         return (*self.turned, *((f"{self.length:g} of the length",) if self.length != 1.0 else ()))
 
 
@@ -81,7 +82,7 @@ def list_variants(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]
 
 
 def merge_variant_overrides(words: Sequence[str], over: Sequence[str]) -> list[str]:
-    """Return the overrides ``words`` followed by ``over``. Those in ``words`` that ``over`` sets again are dropped."""
+    """Return the overrides ``words``, without keys that ``over`` sets, followed by the overrides ``over``."""
     again = {assignment.key for assignment in parse_overrides(over)}
     return [*(a.text for a in parse_overrides(words) if a.key not in again), *over]
 
@@ -94,7 +95,7 @@ class AblationPlan:
         steps: training steps of the centre (the model with the user's settings) in this ablation.
         seconds: approximate time of a training of full length.
         whole: training steps in the centre's configuration; 0 if the configured budget is in seconds.
-        paces: name of a variant -> seconds per training step, divided by those of the centre.
+        paces: name of a variant -> seconds per training step, divided by the centre's seconds per step.
     """
 
     steps: Annotated[int, Range(at_least=1)]
@@ -105,7 +106,8 @@ class AblationPlan:
     def overrides(self, variant: Variant, words: Sequence[str], centre: RunConfig) -> list[str]:
         """Return the overrides that train a variant for its planned length.
 
-        Population control (which adds and moves primitives) runs as many times as in a full run of ``centre``.
+        Population control (which adds and moves primitives) runs as many times as in a full run of ``centre``,
+        unless ``words`` set its interval.
         """
         steps = max(1, round(self.steps * variant.length / self.paces[variant.name]))
         budget = [quote_override(LENGTH, steps)] + ["train.max_seconds=null"] * (centre.train.max_seconds is not None)
@@ -123,7 +125,9 @@ class AblationPlan:
 
 
 def plan_training_lengths(centre: RunConfig, pace: float, available: float, lengths: Sequence[float]) -> AblationPlan:
-    """Return a plan in which all trainings fit into ``available`` seconds, unless they would become too short.
+    """Return a plan with which all trainings together take at most ``available`` seconds.
+
+    If this would make the trainings too short, the plan takes longer.
 
     Args:
         pace: seconds per training step of the centre (the model with the user's settings).
@@ -142,7 +146,7 @@ def plan_training_lengths(centre: RunConfig, pace: float, available: float, leng
 class AblationStepTimes:
     """Timer of the training steps of variants, relative to the centre (the model with the user's settings).
 
-    The timed steps are those halfway through the training, where all bands of spherical harmonics are in use.
+    The timed steps are halfway through the training, because all bands of spherical harmonics are in use there.
 
     Attributes:
         seconds: seconds per training step of the centre.
@@ -156,7 +160,7 @@ class AblationStepTimes:
         self.seconds = self._run_turns(self._centre)[1] / (_STEPS_PER_TURN * _TURNS)
 
     def measure(self, config: RunConfig) -> float | None:
-        """Return the time per step divided by the centre's; None if ``config`` builds the same model as the centre."""
+        """Return the time per step of ``config`` divided by the centre's; None if both build the same model."""
         trainer = self._prepare(config)
         if _ablation_model_identity(trainer) == self._identity:
             return None
@@ -175,7 +179,7 @@ class AblationStepTimes:
         return trainer
 
     def _run_turns(self, trainer: Trainer) -> tuple[float, float]:
-        """Run the same number of training steps of ``trainer`` and of the centre, alternately; return both times, s."""
+        """Run equally many training steps of ``trainer`` and the centre, alternately; return both times in seconds."""
         total = [0.0, 0.0]
         with use_one_torch_thread_for_run():
             for turn in range(_TURNS + 1):
@@ -194,8 +198,9 @@ def _ablation_model_identity(trainer: Trainer) -> tuple[Any, ...]:
 
 
 def combine_ablation_changes(points: Sequence[TradeoffPoint], most: int) -> list[tuple[str, ...]]:
-    """Return at most ``most`` combinations of overrides. They combine changes of single settings that, as measured in
-    ``points``, save bytes, save time or improve quality.
+    """Return at most ``most`` combinations of changes of single settings, each combination as a tuple of overrides.
+
+    Only changes that save bytes, save time or improve quality, as measured in ``points``, are combined.
     """
     centre = points[0]
     smaller, faster, better = [], [], []

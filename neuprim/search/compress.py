@@ -45,7 +45,8 @@ _FIRST_LOSS = 2.0  # loss by rounding before the first round of training, in uni
 _ROUND_STEPS, _MAX_ROUNDS = 500, 3  # least steps of a round, and most rounds; each shows how much training recovers
 
 _SLOPE, _AIM = 0.7, 0.95
-"""dB lost after fine-tuning per dB lost before it; fraction of the tolerance that a round should use."""
+"""``_SLOPE``: dB lost after fine-tuning per dB lost before. ``_AIM``: fraction of the tolerance that a round should use
+up."""
 
 _MAX_TRIES = 16
 
@@ -56,8 +57,8 @@ _FINEST, _COARSEST = 1e-4, 30.0  # limits of the added error, as shares of the m
 class CompressRequest:
     """Request for :func:`compress_run`, with the arguments of ``neuprim compress``.
 
-    ``level`` and ``bits`` set the bits of the parameters. Without both, parameters get as few bits as possible while
-    the PSNR of training views drops by at most ``tolerance``; without data, a default level is used.
+    ``level`` and ``bits`` set the bits of the parameters. If neither is given, parameters get as few bits as possible
+    while the PSNR of training views drops by at most ``tolerance``; without data, a default level is used.
 
     Attributes:
         level: 1 (nearly lossless) to 5 (very small).
@@ -212,7 +213,7 @@ def dequantize(model: Primitives, quantizers: Quantizers) -> Primitives:
 
 
 class QuantizationSearch:
-    """Search for the quantizers of a model, which round its parameters. One number, the *error share*, sets them all.
+    """Search for the quantizers of a model, which round its parameters. One number, the *error share*, determines all.
 
     The error share is the squared error that rounding may add to images, divided by the squared error without rounding.
     Methods begin their search at the share ``start``.
@@ -239,7 +240,7 @@ class QuantizationSearch:
         return fit_quantizers_to_error(self.model, self._effects, share * self._error)
 
     def find_coarsest(self, accept: Callable[[Quantizers], bool], start: float) -> tuple[Quantizers, float]:
-        """Return (quantizers, their error share): the coarsest that ``accept`` accepts, else the finest possible.
+        """Return the coarsest quantizers that ``accept`` accepts, else the finest possible, and their error share.
 
         ``start`` is the first error share to try.
         """
@@ -247,7 +248,7 @@ class QuantizationSearch:
         return self.fit(fine), fine
 
     def find_finest(self, accept: Callable[[Quantizers], bool], start: float) -> tuple[Quantizers, float]:
-        """Return (quantizers, their error share): the finest that ``accept`` accepts, else the coarsest possible.
+        """Return the finest quantizers that ``accept`` accepts, else the coarsest possible, and their error share.
 
         ``start`` is the first error share to try.
         """
@@ -257,7 +258,7 @@ class QuantizationSearch:
     def _bisect(self, is_fine: Callable[[Quantizers], bool], start: float) -> tuple[float, float]:
         """Return two close error shares: ``is_fine`` is true for the first and false for the second.
 
-        At a limit, both shares are equal.
+        If ``is_fine`` is the same for all allowed shares, both are the limit of the allowed range.
         """
         fine, coarse, share = 0.0, 0.0, start
         for _ in range(_MAX_TRIES):
@@ -336,7 +337,7 @@ def search_fewest_bits(
 
 
 def _tolerated_error_share(decibels: float) -> float:
-    """Return the error share (increase of the squared error, relative) that lowers the PSNR by this many dB."""
+    """Return the error share (relative increase of the squared error) that lowers the PSNR by ``decibels``."""
     return float(min(max(10 ** (decibels / 10) - 1, _FINEST), _COARSEST))
 
 

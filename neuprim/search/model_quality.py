@@ -83,7 +83,8 @@ _VIEWS, _QUICK_VIEWS = 24, 8  # views that decide, and how many of them intermed
 _SENSITIVITY_VIEWS = 160  # views for sensitivities, at most; primitives of a short time or a corner are in few views
 
 _FRAMES, _QUICK_FRAMES, _POINTS = 64, 8, 4096
-"""Frames in which the extinction is compared with voxels, at most; frames of quick evaluations; points per frame."""
+"""Largest number of frames in which the extinction is compared with voxels; number of frames that quick evaluations
+use; number of points per frame."""
 
 _DRAWS_PER_FRAME = 6  # number of draws over that of frames; each draw is of a random frame, and these find most
 
@@ -97,7 +98,7 @@ class SearchQuality:
     Attributes:
         views: indices of the training views whose PSNR is measured.
         others: indices of other training views, used to estimate the effect of parameters on images.
-        draws: points with known extinction, one sample per frame; empty unless the run was trained on voxels.
+        draws: sets of points with known extinction, one set per frame; empty unless the run was trained on voxels.
     """
 
     def __init__(self, dataset: Dataset, settings: RenderSettings, inside: bool = False) -> None:
@@ -110,13 +111,14 @@ class SearchQuality:
 
     @classmethod
     def of_run(cls, config: RunConfig, dataset: Dataset) -> SearchQuality:
-        """Return the quality measure of a run. If it was trained on voxels, errors of the extinction count, too."""
+        """Return the quality measure of a run. For a run trained on voxels, errors of the extinction count, too."""
         return cls(dataset, config.renderer, config.train.supervision != "images")
 
     def __call__(self, model: Primitives, quick: bool = False) -> float:
-        """Return a model's quality in dB: the PSNR of images, or less if the extinction has lost more dB than them.
+        """Return a model's quality in dB: the smaller of the PSNR of images and the shifted PSNR of the extinction.
 
-        Losses are relative to the first model that this object evaluated.
+        The shift makes both values equal for the first model that this object evaluates. Without voxels, return the
+        PSNR of images.
 
         Args:
             quick: evaluate fewer views and frames.
@@ -130,7 +132,7 @@ class SearchQuality:
         return min(images, inside + self._offset)
 
     def image_quality(self, model: Primitives, quick: bool = False) -> float:
-        """Return the mean PSNR of the model's images of :attr:`views`; with ``quick``, of some of these views."""
+        """Return the mean PSNR of the model's images of :attr:`views`; ``quick`` uses only some of the views."""
         step = max(len(self.views) // _QUICK_VIEWS, 1) if quick else 1
         values = []
         for index in self.views[::step]:
@@ -140,7 +142,7 @@ class SearchQuality:
         return float(np.mean(values))
 
     def inside_quality(self, model: Primitives, quick: bool = False) -> float:
-        """Return the mean PSNR of the extinction over frames, dB. The peak is a frame's typical extinction."""
+        """Return the mean PSNR of the extinction over frames, dB. The peak is a typical extinction of the frame."""
         values = []
         with torch.no_grad():
             for samples in self.draws[:: max(len(self.draws) // _QUICK_FRAMES, 1) if quick else 1]:
@@ -152,12 +154,12 @@ class SearchQuality:
         return float(np.mean(values))
 
     def inside_weight(self, model: Primitives) -> float:
-        """Return the factor by which squared errors of the extinction become as large as those of images."""
+        """Return the factor that makes squared errors of the extinction as large as squared errors of images."""
         return 10 ** ((self.inside_quality(model) - self.image_quality(model)) / 10)
 
 
 def _draw_search_quality_points(points: PointSupervision) -> list[PointSamples]:
-    """Return samples of points with known extinction, one per frame, for at most 64 frames sorted by name."""
+    """Return one set of points with known extinction per frame, for at most 64 random frames, sorted by name."""
     generator, frames = torch.Generator().manual_seed(0), dict[str, PointSamples]()
     for _ in range(_DRAWS_PER_FRAME * _FRAMES):
         samples = points.draw(_POINTS, generator)

@@ -44,15 +44,16 @@ __all__ = ["PruneRequest", "Pruning", "prune_run"]
 _PATIENCE = 2.0  # a model that lost at most this many tolerances gets another round before its cut is undone
 
 _FIRST_CUT, _GROWTH, _LARGEST_CUT = 6.5, 1.5, 10.0
-"""Intended loss of the first cut, divided by the tolerance; largest factor from one cut to the next; and dB up to which
-a cut that removes nothing is doubled."""
+"""``_FIRST_CUT``: intended loss of the first cut, divided by the tolerance. ``_GROWTH``: largest factor between the
+losses of two successive cuts. ``_LARGEST_CUT``: dB up to which a cut that removes nothing is doubled."""
 
 _REMAINING, _BROUGHT = 0.3, 0.35
-"""Expected fraction of a cut's loss that remains after fine-tuning; fraction of a round's gain beyond this that is also
-expected of the next round."""
+"""``_REMAINING``: expected fraction of a cut's loss that remains after fine-tuning. ``_BROUGHT``: if fine-tuning
+recovers more than expected, the fraction of this surplus that is also expected of the next round."""
 
 _ENOUGH, _FREE = 0.1, 0.02
-"""Fractions of the tolerance: cuts end when less than the first is left; losses below the second are ignored."""
+"""Fractions of the tolerance. Nothing more is cut when less than ``_ENOUGH`` is left. Losses below ``_FREE`` are
+ignored."""
 
 _TIMED_VIEWS = 12
 
@@ -105,7 +106,8 @@ class _PruningState:
 def _saved_share(model: Primitives, smaller: Primitives, numbers: int) -> float:
     """Return the fraction of parameter values that ``smaller`` saves, compared with ``model``.
 
-    It is the larger of two fractions: in the file, where ``model`` has ``numbers`` values, and per primitive.
+    The result is the larger of two fractions: of the values in the file, where ``model`` has ``numbers`` values, and of
+    the values per primitive.
     """
     per_primitive = smaller.parameters_per_primitive / model.parameters_per_primitive
     return max(1 - count_unpruned_numbers(smaller) / numbers, 1 - per_primitive)
@@ -187,7 +189,7 @@ class ModelShrinker:
     def _max_loss(self, before: _PruningState, now: _PruningState, best: _PruningState) -> float:
         """Return the loss in dB above which a cut is undone, because another round of fine-tuning would not recover it.
 
-        ``before`` and ``now`` are the states before and after the last round, ``best`` is the best one so far.
+        ``before`` and ``now`` are the states before and after the last round; ``best`` is the best state so far.
         """
         if best.rounds and best.lost < 0:  # the model before has room, so a smaller cut saves something
             return self.tolerance
@@ -227,7 +229,7 @@ class ModelShrinker:
         return _PruningState(model, (*state.words, *words), bite=bite, cut=self.quality(model), fields_only=True)
 
     def _cut_by_price(self, model: Primitives, quality: Callable[[Primitives], float], loss: float) -> Primitives:
-        """Return the model without the primitives and units of least effect per value; it loses at most ``loss`` dB."""
+        """Return the model without the primitives and units of least effect per value; at most ``loss`` dB are lost."""
         if loss <= 0:
             return model
         self._sensitivity_seed += 1
@@ -368,7 +370,7 @@ def _fit_pruned(
 ) -> Fitted:
     """Return a pruned model as a finished training that can be saved and evaluated.
 
-    Its configuration has overrides that build such a model; ``words`` are the reductions of fields by pruning.
+    The configuration has overrides that build such a model; ``words`` are the reductions of fields by pruning.
     """
     reduced = [*config.model.reduced, *words]
     own = [f"model.primitives={model.count}"]

@@ -68,8 +68,8 @@ def price_cuts(
 ) -> Sensitivity:
     """Return the effect of removing each primitive and each unit (e.g. a neuron in one primitive).
 
-    The effect is the mean squared change of images, estimated in ``views``. With ``inside``, the weighted squared
-    change of the extinction is added.
+    The effect is the mean squared change of images. ``views`` has the sensitivity of images. ``inside`` has the
+    sensitivity of the extinction; if it is given, the weighted squared change of the extinction is added.
     """
     priced = replace(views, whole=views.whole * _measure_contrast(model, views, quality))
     return priced if inside is None else priced.combine(inside, quality.inside_weight(model))
@@ -78,7 +78,7 @@ def price_cuts(
 def _measure_contrast(model: Primitives, effects: Sensitivity, quality: SearchQuality) -> float:
     """Return the mean squared difference between primitives' colours and the colours behind them.
 
-    It is measured by removing a few primitives with the least effect.
+    This contrast is measured by removing a few primitives with the least effect.
     """
     count = max(int(_PROBE * model.count), 1)
     order = effects.whole.where(effects.seen > 0, torch.inf).argsort(stable=True)
@@ -96,7 +96,8 @@ class _Sizes(NamedTuple):
     """Numbers of parameter values that pruning can remove from N primitives.
 
     ``whole`` (N,) has the number of values of each primitive, without removed units. ``present`` maps the name of a
-    unit to an (N,) bool mask of the primitives that have the unit. ``units`` maps it to its values per primitive.
+    unit to an (N,) bool mask of the primitives that have the unit. ``units`` maps the name to the number of the unit's
+    values per primitive.
     """
 
     whole: Tensor
@@ -107,7 +108,9 @@ class _Sizes(NamedTuple):
 def cut_to_loss(
     model: Primitives, prices: Sensitivity, quality: Callable[[Primitives], float], loss: float
 ) -> Primitives:
-    """Return a model without the primitives and units of least effect per value; it loses at most ``loss`` dB.
+    """Return a model without the primitives and units of least effect per parameter value.
+
+    The quality of the model drops by at most ``loss`` dB.
 
     Args:
         prices: effect of every primitive and unit on images, see :func:`price_cuts`.
@@ -134,7 +137,7 @@ def cut_to_loss(
 
 
 def _prune_below_price(model: Primitives, prices: Sensitivity, sizes: _Sizes, price: float) -> Primitives:
-    """Return a model without primitives and units whose effect on images per value is below ``price``."""
+    """Return a model without primitives and units whose effect per parameter value is below ``price``."""
     known = prices.seen > 0  # nothing is known of primitives in no view
     kept = (~known | (prices.whole / sizes.whole >= price)).nonzero()[:, 0]
     gone = {}

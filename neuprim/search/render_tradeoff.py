@@ -137,7 +137,7 @@ class _RenderTradeoffSession(TradeoffSession):
     def single_changes(self, knobs: Mapping[str, list[RenderConfig]]) -> Iterator[tuple[str, RenderConfig]]:
         """Yield (setting, configuration) for each change of a single setting that this machine can render.
 
-        The record notes the others as left out.
+        Changes that this machine cannot render are noted in the record.
         """
         base = self.setup.backend(self.setup.reference).name
         for name, configs in self.choose_knobs(knobs).items():
@@ -170,7 +170,10 @@ class _RenderTradeoffSession(TradeoffSession):
         return config.settings == reference.settings and config.resolution == reference.resolution
 
     def combinations(self) -> list[RenderConfig]:
-        """Return render configurations that combine single changes which reduce time or bytes: earlier and new ones."""
+        """Return the configurations in the record that combine several changes, and new combinations.
+
+        New combinations consist of single changes that reduce time or bytes.
+        """
         base, *others = self.record.points
         faster, smaller, known = [], [], []
         for point in others:
@@ -192,7 +195,7 @@ class _RenderTradeoffSession(TradeoffSession):
 
 
 def _render_tradeoff_identity(setup: TradeoffSetup) -> dict[str, Any]:
-    """Return the facts that must be equal to reuse earlier points, as JSON-ready values."""
+    """Return facts on model, settings and machine as JSON-ready values. Points are only reused if all are equal."""
     config, conditions = setup.config, describe_tradeoff_conditions(setup.views)
     conditions["machine"]["device"] = setup.backend(setup.reference).computing_on(setup.reference.settings)
     return {

@@ -17,20 +17,22 @@ from neuprim.config.command_settings import SearchTarget
 from neuprim.search.target_record import Attempt, Purpose, SettingChange, TargetRecord, forecast_time
 
 ALLOWANCE, MIN_MARGIN = 0.1, 0.05
-"""Margin above the target quality that full runs aim at, and least margin, dB. Quantization loses about as much."""
+"""``ALLOWANCE``: margin that full runs aim at, dB. ``MIN_MARGIN``: least margin of a full run that is good enough, dB.
+A margin is needed because quantization loses quality later."""
 
 _FULL_FILE = 0.97  # share of the allowed bytes to plan with
 
 _STEP_RATIO, _MIN_RATIO, _MAX_RATIO = 0.75, 0.5, 1.0
-"""dB gained by a doubling of training steps, over those of the previous doubling: usual, least and largest value."""
+"""Gain in dB by a doubling of the training steps, divided by the gain of the previous doubling: usual, least and
+largest value."""
 
 _SIZE_RATIO = 0.65  # gain of a doubling of primitives over that of the doubling before, beyond the sizes tried
 _FIRST_GAIN, _FIRST_SLOPE = 1.3, 1.0  # dB that a doubling of steps, and of primitives, gains where nothing is known
 _SEED_NOISE = 0.1  # dB between two seeds of one configuration
 
 _FURTHEST, _APART, _CLOSE = 3.0, 0.5, 0.3
-"""Distances between numbers of primitives, in doublings: the largest from a tried number to the next; the least between
-two numbers that give a slope; and the largest at which a second number gives no new information."""
+"""Distances between numbers of primitives, in doublings. ``_FURTHEST``: largest distance from a tried number to the
+next. ``_APART``: least distance of two numbers that give a slope. ``_CLOSE``: numbers this close count as equal."""
 
 
 class Forecast(NamedTuple):
@@ -76,14 +78,16 @@ def forecast_quality(lengths: Mapping[int, float], steps: float, gain: float = _
 def _sum_forecast_gains(gain: float, ratio: float, doublings: float) -> float:
     """Return the gain of the next ``doublings``, if each gains ``ratio`` times as much as the previous one.
 
-    The sum gain * (ratio + ratio^2 + ...) has ``doublings`` terms, also for a fractional number.
+    ``gain`` is the gain of the last doubling. The result is gain * (ratio + ratio^2 + ...) with ``doublings`` terms.
+    The closed form of the sum also allows a fractional number.
     """
     return gain * doublings if ratio == 1 else gain * ratio * (1 - ratio**doublings) / (1 - ratio)
 
 
 def _bisect_count(low: float, high: float, is_low: Callable[[float], bool]) -> tuple[float, float]:
-    """Bisect on a logarithmic scale between two numbers of primitives. Return two close numbers: ``is_low`` is true for
-    the first and false for the second.
+    """Return two close numbers of primitives: ``is_low`` is true for the first and false for the second.
+
+    The numbers are found by bisection between ``low`` and ``high`` on a logarithmic scale.
     """
     for _ in range(60):
         middle = math.sqrt(low * high)
@@ -93,7 +97,7 @@ def _bisect_count(low: float, high: float, is_low: Callable[[float], bool]) -> t
 
 @dataclass(frozen=True)
 class SizeCurve:
-    """Curve of the margin (predicted quality minus target, dB) over log2 of the number of primitives. It never falls.
+    """Non-decreasing curve of the margin (predicted quality minus target, dB) over log2 of the number of primitives.
 
     ``nodes`` are the curve's points (log2 of the number, margin), in ascending order.
     """
@@ -102,7 +106,7 @@ class SizeCurve:
 
     @classmethod
     def fit(cls, tried: Sequence[tuple[int, float]]) -> SizeCurve:
-        """Fit a curve to (primitives, margin) pairs. Neighbours with falling margins get their mean margin."""
+        """Fit a curve to (primitives, margin) pairs. Neighbours get their mean margin where margins would fall."""
         blocks: list[tuple[list[float], float]] = []
         for count, margin in sorted(tried):
             blocks.append(([math.log2(count)], margin))
@@ -141,7 +145,7 @@ class SizeCurve:
         return self.at(primitives * 2**_APART) - self.at(primitives / 2**_APART)
 
     def find_count(self, wanted: float, highest: int) -> int | None:
-        """Return the least number of primitives that has the margin ``wanted``; None if it exceeds ``highest``."""
+        """Return the least number of primitives with the margin ``wanted``; None if it would exceed ``highest``."""
         if self.at(1) >= wanted:
             return 1
         if self.at(max(highest, 1)) < wanted:
@@ -166,7 +170,7 @@ def propose_size(tried: Sequence[tuple[int, float]], highest: int, wanted: float
     Args:
         tried: a pair (primitives, margin) for each number tried, one or more.
         highest: limit on the number of primitives.
-        doubt: uncertainty of margins, dB. A target is only unreachable if it is missed by more than this.
+        doubt: uncertainty of margins, dB. A target is only unreachable if it is missed by more than ``doubt``.
     """
     curve, counts = SizeCurve.fit(tried), sorted({count for count, _ in tried})
     found = curve.find_count(wanted, highest)
@@ -186,7 +190,7 @@ def propose_size(tried: Sequence[tuple[int, float]], highest: int, wanted: float
 
 
 def _move_from_tried_size(tried: int, found: int, highest: int) -> int:
-    """Return ``found``, moved away from ``tried``, the only number so far, if both are too close to measure a slope."""
+    """Return ``found``, moved away from the only tried number ``tried`` if both are too close to measure a slope."""
     step = math.log2(found / tried)
     if abs(step) < _APART:
         up, down = round(tried * 2**_APART), round(tried / 2**_APART)
@@ -281,13 +285,13 @@ class SizePredictor:
         return forecasts | {n: Forecast(value, ALLOWANCE) for n, value in full.items()}
 
     def _relevant(self, *purposes: Purpose) -> list[Attempt]:
-        """Return the finished trainings of these purposes whose settings the search uses now, or has used earlier."""
+        """Return the finished trainings of ``purposes``, except those with settings that the search never adopted."""
         history = self.record.history
         finished = self.record.finished(*purposes)
         return [a for a in finished if all(value in history(key) for key, value in a.words.items())]
 
     def _changes_since(self, attempt: Attempt) -> list[SettingChange]:
-        """Return the adopted changes of settings that a training was made without."""
+        """Return the changes of settings that the search has adopted, but that a training does not have."""
         changes = []
         for turn in self.record.turns:
             values = self.record.history(turn.key)
@@ -296,15 +300,15 @@ class SizePredictor:
         return changes
 
     def _with_current_settings(self, name: str, attempt: Attempt) -> float:
-        """Return the measure ``name`` of a training, dB, less the losses by settings changed since."""
+        """Return a training's measure ``name``, dB, minus the losses by changes of settings that it does not have."""
         loss = sum(turn.loss.get(name, 0.0) for turn in self._changes_since(attempt))
         return to_forecast_decibels(name, attempt.measured(name)) - loss
 
     def margins(self) -> list[tuple[int, float]]:
         """Return a pair (primitives, margin in dB) for every number of primitives that was trained.
 
-        The margin is the quality minus the target. A training of full length (a full run) has measured it; for shorter
-        trials it is a forecast. Forecasts are clamped between the margins of the next smaller and larger full runs.
+        The margin is the quality minus the target. Full runs (trainings of full length) have measured margins; shorter
+        trials have forecasts. A forecast is clamped between the margins of the next smaller and larger full runs.
         Between a full run that misses the target and one that meets it, forecasts are left out.
         """
         margins = {

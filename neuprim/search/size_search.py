@@ -41,13 +41,14 @@ from neuprim.search.target_record import (
 from neuprim.search.trials import get_trial_setting
 
 _MAX_MARGIN, _NEAR = 0.3, 1.08
-"""A full run is good enough up to this margin above the target, dB, and up to this many times the predicted number of
-primitives."""
+"""Upper limits up to which a full run is good enough: limit of the margin above the target in dB, and limit of the
+number of primitives divided by the predicted number."""
 
 _TRIALS, _FULL = 0.33, 0.34  # shares of the budget for trials and for a full run; the rest is for another one
 
 _SHORTER, _PACE_STEPS, _MIN_STEPS = 8, 24, 16
-"""Steps of a full run over those of a trial; steps of the first training, which is timed; least steps of a trial."""
+"""Steps of a full run divided by the steps of a trial; steps of the first training, which measures the time per step;
+least steps of a trial."""
 
 _MAX_SIZES, _MAX_CHANGES, _MAX_FULL = 6, 4, 5
 
@@ -55,8 +56,8 @@ _MIN_SLOPE = 0.8  # dB that twice as many primitives gain in full runs, at least
 _BEYOND, _BELOW = 2.0, 3.0  # a full run has at most this many times the largest, and 1/this of the smallest size tried
 
 _MIN_STEP, _MORE_STEPS = 1.07, 0.75
-"""Least factor between the numbers of primitives of two full runs, and least fraction of the steps of an earlier one
-that another full run must have."""
+"""``_MIN_STEP``: least factor between the numbers of primitives of two full runs. ``_MORE_STEPS``: least number of
+steps of a further full run, divided by the steps of the full run before."""
 
 _MORE = 1.25  # factor by which limits must allow more primitives for another full run
 _SLOWER = 1.5  # a full run that becomes this many times slower is cut short
@@ -70,7 +71,7 @@ _MAX_REFUSED = 2  # values of a setting that may fail before the search leaves i
 def list_smaller_settings(config: RunConfig, task: TaskSpec, dataset: Dataset) -> dict[str, tuple[SettingValue, ...]]:
     """Return setting -> values, for settings that can reduce the number of parameters per primitive.
 
-    Values are sorted by the number of parameters; the current one is last. The setting that can save most is first.
+    Values are sorted by the number of parameters; the current value is last. The setting that can save most is first.
     """
 
     def count_numbers(config: RunConfig) -> int:
@@ -99,8 +100,9 @@ def propose_setting_trial(
 ) -> tuple[str, SettingValue, SettingValue] | None:
     """Return (setting, current value, value to try) of the next trial; None if no trial is left.
 
-    The value is found by bisection of ``values``, sorted by size (:func:`list_smaller_settings`). It is halfway between
-    the current value and the closest smaller one that was tried but not adopted (see ``turns``), else the smallest one.
+    The value to try is found by bisection of ``values``, sorted by size (:func:`list_smaller_settings`). It is halfway
+    between the current value and a smaller value: the closest value that was tried but not adopted (see ``turns``), or
+    else the smallest value.
     """
     for key, ladder in values.items():
         own = [turn for turn in turns if turn.key == key]
@@ -117,7 +119,7 @@ def setting_change_pays(loss: float, size: float, slope: float) -> bool:
 
     Args:
         loss: loss of quality by the change, at an equal number of primitives, dB.
-        size: bytes per primitive after the change, divided by those before.
+        size: bytes per primitive after the change, divided by bytes per primitive before.
         slope: gain of quality by twice as many primitives, dB.
     """
     return bool(size * 2 ** (max(loss, 0.0) / slope) < _PAYS)
@@ -128,7 +130,7 @@ def setting_change_pays(loss: float, size: float, slope: float) -> bool:
 
 @dataclass
 class SizeSearch:
-    """Search for the smallest model that meets a target (quality, file size, speed). It resumes from its record."""
+    """Search for the smallest model that meets a target (quality, file size, speed). It can resume from its record."""
 
     config: RunConfig
     target: SearchTarget
@@ -149,7 +151,7 @@ class SizeSearch:
         return SizePredictor(self.target, self.record, self.full_steps)
 
     def run(self) -> None:
-        """Run all stages of the search that the record does not have yet."""
+        """Run all stages of the search that are not finished according to the record."""
         kept = sum(a.outcome is not None for a in self.record.attempts)
         if kept:
             self.runner.notify(f"{kept} earlier trainings are kept")
@@ -169,7 +171,7 @@ class SizeSearch:
         if possible < needed:
             enough = "" if self.max_steps < needed else f"a budget of {needed * pace / _FULL:.0f} s, "
             raise ConfigError(
-                f"budget={self.record.asked['budget']:g}s: enough for {possible:.0f} steps of {first.count:,} "
+                f"budget={self.record.asked['budget']:g}s: enough for only {possible:.0f} steps of {first.count:,} "
                 f"primitives; expected at least {needed} steps. Give {enough}fewer "
                 "primitives (model.primitives) or smaller images"
             )
@@ -182,8 +184,8 @@ class SizeSearch:
     def _highest(self) -> int:
         """Return the largest number of primitives to try.
 
-        It is within the target's limits, and not above a number at which a trial stopped growing. Its full run has at
-        least twice as many steps as a trial.
+        The number is within the target's limits, and not above a number at which the model of a trial stopped growing.
+        A full run with this number has at least twice as many steps as a trial.
         """
         low = high = self.config.model.count
         while self.full_steps(high) > 2 * self.record.length and high < 2**24:
@@ -196,7 +198,7 @@ class SizeSearch:
         return max(1, min([low, *saturated, *([] if limit is None else [limit])]))
 
     def _try_size(self, primitives: int) -> None:
-        """Run two trials with this number of primitives, one twice as long, to measure the gain by more steps."""
+        """Run two trials with this number of primitives. One is twice as long, to measure the gain by more steps."""
         length, words = self.record.length, self.record.words
         attempts = [Attempt("size", words, primitives, steps) for steps in (length // 2, length)]
         for several in [attempts] if self.runner.parallel else [[attempt] for attempt in attempts]:
@@ -206,7 +208,7 @@ class SizeSearch:
                     self.runner.notify(_describe_attempt(done, self.predictor.predict(done.count)))
 
     def _try_sizes(self) -> None:
-        """Run trials with different numbers of primitives, until the best is known or the time for trials is used."""
+        """Run trials with different numbers of primitives, until the best number is known or time is up."""
         first = min(self.config.model.count, self._highest())
         self._try_size(first)
         lengthened = False
@@ -294,7 +296,7 @@ class SizeSearch:
     def _change_settings(self) -> None:
         """Run trials of changed settings that save bytes, and adopt the changes that pay.
 
-        The trials use that number of primitives, of those tried, that is closest to :meth:`_wanted`.
+        The trials use the number of primitives that is closest to :meth:`_wanted`, among the numbers tried so far.
         """
         if self.record.out_of_reach or not (self.target.quality or self.target.megabytes is not None):
             return
@@ -345,7 +347,7 @@ class SizeSearch:
             self.runner.notify(_describe_attempt(self.runner.run(attempt)[0], {}))
 
     def _is_good(self, attempt: Attempt) -> bool:
-        """Return whether another full run is unlikely to be better than this one."""
+        """Return whether a full run is so good that another full run is unlikely to be better."""
         if exceeded_limit(self.target, attempt) is not None:
             return False
         if not self.target.quality:
@@ -354,7 +356,7 @@ class SizeSearch:
         return MIN_MARGIN <= margin <= _MAX_MARGIN and attempt.count <= _NEAR * self._wanted()
 
     def _plan_full(self) -> Attempt | None:
-        """Return the next full run; None if there is no time for it, or it would hardly differ from an earlier one."""
+        """Return the next full run; None if time is too short, or if it would hardly differ from an earlier run."""
         finished, wanted, budget = self.record.finished("full"), self._wanted(), self.record.asked["budget"]
         pace, left = self.runner.pace(wanted), self.runner.seconds_left - self._reserve(wanted)
         share = left if finished else max(left / 2, min(left, _FULL * budget))

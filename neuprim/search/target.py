@@ -137,7 +137,7 @@ def _check_target_config(config: RunConfig) -> None:
 def _resume_target_search(config: RunConfig, asked: dict[str, float]) -> TargetRecord:
     """Return the record of an earlier search in the run's directory, or a new record.
 
-    If the target or the budget has changed, the new record keeps the finished trainings, but no time counts as used.
+    If the target or the budget has changed, the new record keeps the finished trainings, but the used time starts at 0.
     """
     folder, own = config.output_dir, (*NOT_TRAINED_WITH, "made_by")
     same: dict[str, Any] = json.loads(json.dumps({k: v for k, v in config.to_dict().items() if k not in own}))
@@ -287,10 +287,10 @@ def _prune_full_run(
 
 
 def _quantize_target_model(runner: TrialRunner, predictor: SizePredictor, before: _TargetResult) -> _TargetResult:
-    """Write the quantized model file; return the new result. The file is as coarse as the target quality allows.
+    """Write the quantized model file; return the new result. Numbers are rounded as coarsely as the target allows.
 
-    If the model misses the target already, it loses at most :data:`ALLOWANCE` dB more. If the target is only a limit of
-    bytes, the file is as fine as the limit allows.
+    If the model misses the target quality already, it loses at most :data:`ALLOWANCE` dB more. If the target only
+    limits the bytes, numbers are rounded as finely as this limit allows.
     """
     target, task, file = predictor.target, load_config_task(runner.config), before.run_dir / COMPRESSED
     model, header = load_model_checkpoint(before.run_dir / "model.safetensors", task)

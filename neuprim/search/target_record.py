@@ -38,7 +38,7 @@ class Attempt:
 
     Attributes:
         purpose: "pace" measures the time per step, "size" a number of primitives, "knob" a changed setting. "full" is a
-            full run: a candidate for the result. The others are trials.
+            full run: a candidate for the result. Trainings with other purposes are trials.
         words: setting -> changed value, except the number of primitives, e.g. {"model.sh_degree": 1}.
         primitives, steps: requested numbers of primitives and training steps.
         max_seconds: time limit of a full run; None for trials.
@@ -87,7 +87,7 @@ class SettingChange:
 
     Attributes:
         loss: quality measure -> loss in dB, at an equal number of primitives.
-        size: bytes per primitive after the change, divided by those before.
+        size: bytes per primitive after the change, divided by bytes per primitive before.
         adopted: whether the search keeps the change, because it makes a model of equal quality smaller.
     """
 
@@ -202,7 +202,7 @@ class TrialRunner:
     Attributes:
         config: configuration from which the search starts.
         dataset: data of the whole scene.
-        clock: function that returns monotonic seconds; it returned ``begun`` at the start of the budget.
+        clock: function that returns monotonic seconds; ``begun`` is its value at the start of the budget.
     """
 
     config: RunConfig
@@ -256,9 +256,10 @@ class TrialRunner:
         return any(a.repeats(attempt) and a.outcome is not None for a in self.record.attempts)
 
     def run(self, *wanted: Attempt) -> list[Attempt]:
-        """Train the requested attempts that have no outcome in the record; return all of them with their outcomes.
+        """Train the requested attempts that have no outcome in the record; return all requested attempts.
 
-        A KeyboardInterrupt leaves an unfinished attempt in the record. The same call resumes it from its checkpoint.
+        A KeyboardInterrupt leaves an unfinished attempt in the record. The same call resumes this attempt from its
+        checkpoint.
         """
         attempts = [next((a for a in self.record.attempts if a.repeats(one)), one) for one in wanted]
         todo = [attempt for attempt in attempts if attempt.outcome is None]

@@ -48,7 +48,7 @@ T = TypeVar("T")
 
 @dataclass
 class TradeoffSetup:
-    """A run's model, its evaluation views, and its reference render configuration, with which others are compared."""
+    """A run's model, evaluation views, and reference: the render configuration with which others are compared."""
 
     config: RunConfig
     model: Primitives
@@ -113,7 +113,7 @@ def load_tradeoff_setup(
     """Load a finished run to measure its quality and speed.
 
     Args:
-        overrides: render settings of the reference configuration, on top of the run's.
+        overrides: render settings of the reference configuration, on top of the run's render settings.
         views: limit on the number of evaluation views, which are evenly spread over the test views.
         lpips: weights for LPIPS; None for those of the run.
         loaded: data set and evaluation views, if they are loaded already.
@@ -137,7 +137,7 @@ def load_tradeoff_setup(
 
 
 def describe_tradeoff_conditions(views: Sequence[EvalView]) -> dict[str, Any]:
-    """Return the views, machine and versions of measurements, which must be equal to reuse the measurements."""
+    """Return the views, machine and versions of measurements. If any of these differ, no measurement is reused."""
     camera = views[0].view.camera
     return {
         "views": [one.view.name for one in views],
@@ -208,13 +208,13 @@ def time_tradeoff_points(
 
     In a round, every point with fewer than ``repeats`` rounds renders every view, in random order. Each frame is
     rendered twice. Only the second time counts, because the model is then in the caches. A round adds to each point the
-    mean milliseconds per frame, and the frame time divided by the reference's. The latter is a median over views, so
-    brief load of the machine has no effect.
+    mean milliseconds per frame, and the frame time divided by the reference's. This ratio is a median over views, so
+    that brief load of the machine has no effect.
 
     Args:
-        repeats: number of rounds that each point should have, including earlier ones.
-        deadline: value of :func:`time.monotonic` at which to end. The first round always runs; another one only if it
-            is expected to end in time.
+        repeats: number of rounds that each point should have, including earlier rounds.
+        deadline: value of :func:`time.monotonic` at which to end. The first round always runs. A further round only
+            runs if it is expected to end in time.
         done: called with (round, number of rounds) after each round.
     """
     order = torch.Generator().manual_seed(len(timed[0].point.ms))
@@ -256,8 +256,8 @@ class TradeoffRequest:
     """Request for a trade-off, with the arguments of ``neuprim tradeoff``.
 
     Attributes:
-        words: overrides of the reference. For a finished run they are render settings; to train models, they are
-            overrides of ``neuprim run``.
+        words: overrides of the reference: render settings for a finished run, or overrides of ``neuprim run`` if models
+            are trained.
         budget: approximate time in seconds; measurements that do not fit are left out.
         views: limit on the number of held-out views to measure; they are evenly spread.
         repeats: number of rounds of timing.

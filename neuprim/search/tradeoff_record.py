@@ -50,7 +50,7 @@ def pareto_front(points: Sequence[T], objectives: Callable[[T], Objectives]) -> 
     """Return the points on the Pareto front of cost and quality, best quality first.
 
     Measured costs of equal points differ by chance. A point must therefore be cheaper than the next better one by more
-    than the sum of both uncertainties. The same holds for a point of equal quality to replace an earlier one.
+    than the sum of both uncertainties. A point of equal quality replaces an earlier point on the same condition.
     """
     known = [(o, p) for p in points if not math.isnan((o := objectives(p)).cost) and not math.isnan(o.quality)]
     front: list[tuple[Objectives, T]] = []
@@ -106,7 +106,7 @@ def combine_pareto_steps(
     """Return at most ``most`` new combinations of overrides, i.e. none of ``known``.
 
     A direction is a list of steps with one goal, e.g. fewer bytes. For each direction, :func:`chain_pareto_steps` makes
-    a chain of combinations. The returned ones are evenly spread along all chains.
+    a chain of combinations. The returned combinations are evenly spread along all chains.
     """
     taken = {frozenset(overrides) for overrides in known}
     chains = [[way for way in chain_pareto_steps(steps) if frozenset(way) not in taken] for steps in directions]
@@ -140,7 +140,8 @@ class TradeoffPoint:
         bytes: size of the model file.
         ms: mean milliseconds per frame in each round.
         ratios: frame time divided by the reference's in each round.
-        turned, length: overrides on top of the centre's, and fraction of the full training length, of a trained model.
+        turned, length: for a trained model, overrides added to the centre's overrides (the centre has the user's
+            settings), and fraction of the full training length.
         centre_ms: median milliseconds per frame of the centre over all rounds.
         run_dir: run directory, relative to the record's folder; empty unless trained.
     """
@@ -168,12 +169,12 @@ class TradeoffPoint:
 
     @property
     def ratio(self) -> float:
-        """Frame time divided by the reference's, median over rounds."""
+        """Median over rounds of the frame time divided by the reference's frame time."""
         return statistics.median(self.ratios) if self.ratios else float("nan")
 
     @property
     def time(self) -> float:
-        """Milliseconds per frame. For trained models ``ratio * centre_ms``, as the load varies between rounds."""
+        """Milliseconds per frame. For trained models: ``ratio * centre_ms``, because the load varies between rounds."""
         if self.centre_ms:
             return self.ratio * self.centre_ms
         return statistics.median(self.ms) if self.ms else float("nan")
@@ -259,7 +260,7 @@ class TradeoffRecord:
         return [name for name in same if self.same.get(name) != same[name]]
 
     def leave_out(self, knob: str, words: Sequence[str], reason: str) -> None:
-        """Note why the setting ``knob`` with the overrides ``words`` is not measured; replaces an earlier note."""
+        """Note why the setting ``knob`` with the overrides ``words`` is not measured, in place of an earlier note."""
         words = tuple(words)
         others = [one for one in self.left_out if (one.knob, one.words) != (knob, words)]
         self.left_out = [*others, LeftOutPoint(knob, words, reason)]
@@ -304,7 +305,7 @@ def read_tradeoff_record(path: Path) -> TradeoffRecord | None:
         left_out = [validate_settings(LeftOutPoint, entry, "left_out") for entry in data["left_out"]]
         speed, size = (validate_value(data["front"][name], list[int], f"front.{name}") for name in ("speed", "size"))
         if not points or not all(0 <= number < len(points) for number in (*speed, *size)):
-            raise ValueError(f"front: expected numbers of the {len(points)} points")
+            raise ValueError(f"front: expected point numbers below {len(points)}")
         known = ("format", "same", "points", "left_out", "front")
         facts = {key: value for key, value in data.items() if key not in known}
         return TradeoffRecord(dict(data["same"]), facts, points, left_out, speed, size)

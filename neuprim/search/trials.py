@@ -1,8 +1,8 @@
 """Short trainings that searches compare, in this process or as jobs of a launcher.
 
 A trial's folder is a run directory without report and pictures. Its ``trial.json`` stores the request and, at the end,
-the outcome. A finished trial is not repeated, an interrupted one resumes from its checkpoint, and one with other
-settings is trained anew.
+the outcome. A finished trial is not repeated, and an interrupted trial resumes from its checkpoint. If the
+settings have changed, the trial is trained anew.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ign
 
 
 def _trial_request(trial: Trial) -> dict[str, Any]:
-    """Return the settings that must be equal to reuse a trial's folder, with the types that reading JSON gives."""
+    """Return a trial's settings, with the types that reading JSON gives. Equal settings allow reusing a folder."""
     config = replace(trial.config, made_by=current_config_provenance(trial.config, load_config_task(trial.config)))
     settings = {name: value for name, value in config.to_dict().items() if name not in NOT_TRAINED_WITH}
     request: dict[str, Any] = json.loads(json.dumps({**settings, "hold_out": trial.hold_out}))
@@ -204,7 +204,7 @@ def launch_trials(
         progress: called with the finished fraction of all trials, 0..1.
 
     Raises:
-        KeyboardInterrupt: after Ctrl-C; finished trials stay on disk, unfinished ones have checkpoints.
+        KeyboardInterrupt: after Ctrl-C; finished trials stay on disk, and unfinished trials have checkpoints.
         RuntimeError: a job failed because of a bug; the message has its traceback.
     """
     call, jobs = f"{run_trial_job.__module__}:{run_trial_job.__name__}", []

@@ -1,6 +1,6 @@
 """The controls of a viewer's browser page (conditions, render settings, held-out views, primitives).
 
-:class:`SessionManager` adds them to each opened page.
+:class:`SessionManager` adds the controls to each opened page.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _YELLOW = np.array([[255, 210, 0]], np.uint8)
 
 
 def format_viewer_condition(spec: ConditionSpec, value: Tensor, world: World) -> str:
-    """Return the value of a condition, e.g. time or light position, as text, as ``neuprim render`` takes it."""
+    """Return the value of a condition, e.g. time or light position, as text that ``neuprim render`` accepts."""
     digits = 4 if spec.place is None or world.identity else 10
     return ",".join(f"{x:.{digits}g}" for x in spec.given(value, world).flatten().tolist())
 
@@ -97,7 +97,7 @@ class ConditionControls:
         return format_viewer_condition(spec, self.session.conditions[spec.name], self.session.scene.world)
 
     def _add_handle(self, spec: ConditionSpec) -> Any:
-        """Add a draggable handle to the 3D scene and return it, if the condition is a position; else return None."""
+        """Add a draggable handle to the 3D scene if the condition is a position. Return the handle, or None."""
         if spec.shape != (3,) or "scene units" not in spec.unit:
             return None
         value, scene = self.session.conditions[spec.name], self.session.client.scene
@@ -194,7 +194,7 @@ class RenderControls:
 
 
 class ViewControls:
-    """List of held-out views. Choosing one moves the camera there and shows ground truth, rendering and PSNR."""
+    """List of held-out views. Choosing a view moves the camera there and shows ground truth, rendering and PSNR."""
 
     def __init__(self, session: Session, on_jump: Callable[[], None]) -> None:
         self.session, self._on_jump = session, on_jump
@@ -299,7 +299,7 @@ class PrimitiveControls:
         self._show_meshes("/chosen", found, wire=True)
 
     def _show_meshes(self, name: str, found: FrameEllipsoids | None, wire: bool) -> None:
-        """Replace the ellipsoids of viser's scene node ``name`` by ``found``; None only removes the old ones."""
+        """Replace the ellipsoids of viser's scene node ``name`` by ``found``; None only removes the old ellipsoids."""
         if name in self._meshes:
             self._meshes.pop(name).remove()
         if found is None or not len(found.rows):
@@ -324,7 +324,7 @@ class PrimitiveControls:
 
 
 class SessionManager:
-    """Manager of the open pages: it creates a session for each opened page, and drops it when the page closes.
+    """Manager of the open pages: it creates a session for each opened page and drops the session of a closed page.
 
     ``sessions`` maps the id of an open page to its session.
     """

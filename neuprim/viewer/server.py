@@ -2,11 +2,11 @@
 
 viser accepts every client, including any web page open in the user's browser, because browsers let pages open
 WebSockets to this machine. Therefore a request must have a secret token, the server's own host name, and the viewer's
-page as origin. The printed address contains the token. The page gets it as a cookie, which pages of other sites cannot
-send.
+page as origin. The printed address contains the token. The page gets the token as a cookie, which pages of other sites
+cannot send.
 
 viser does not check messages either. :class:`ViewerConnection` passes a message only if the code of the viewer's page
-sends messages of this type. It passes a new value of a control only if the control can take this value.
+sends messages of this type. A message that sets a control passes only if the control can take the value.
 
 Importing this module raises BackendUnavailable if viser is missing.
 """
@@ -76,11 +76,13 @@ class TokenAuth:
     def guard_server(
         self, check_message: Callable[[Any], str | None], on_refusal: Callable[[Any, str], None]
     ) -> Iterator[None]:
-        """Context manager: add the checks to a viser server that starts inside; then :attr:`installed` is True.
+        """Return a context manager that adds the checks to a viser server.
+
+        The server must start inside the context; :attr:`installed` is then True.
 
         viser passes its own request hook to ``websockets.asyncio.server.serve`` and offers no way to add another hook.
-        Therefore ``serve`` is replaced while viser starts. A proxy would leave viser's own port open to every page.
-        The arguments are those of :class:`ViewerConnection`.
+        Therefore ``serve`` is replaced while viser starts. A proxy in front of viser would be no protection, because
+        every page could still reach viser's own port. The arguments are those of :class:`ViewerConnection`.
         """
         original = websocket_server.serve
         connection: Any = functools.partial(ViewerConnection, check_message=check_message, on_refusal=on_refusal)
@@ -134,7 +136,8 @@ class TokenAuth:
     def _is_own_name(self, host: str) -> bool:
         """Return whether ``host``, from a request's Host header, is a name of this server.
 
-        A server that listens on all addresses accepts any IP address: DNS rebinding attacks need a host name.
+        If the server listens on all addresses, any IP address is accepted as its name. This is safe, because DNS
+        rebinding attacks need a host name.
         """
         name = re.sub(r":\d+$", "", host).lower()
         return name in self._hosts or (_is_unspecified_viewer_host(self._hosts[-1]) and _parse_ip(name) is not None)
@@ -153,7 +156,10 @@ def _is_unspecified_viewer_host(host: str) -> bool:
 
 
 def _cookie_name(host: str) -> str:
-    """Return the name of the token's cookie. It contains the port, as browsers send cookies to all ports of a host."""
+    """Return the name of the cookie that holds the token.
+
+    The name contains the port, because browsers send cookies to all ports of a host.
+    """
     return f"neuprim-{host.rpartition(':')[2] if re.search(r':[0-9]+$', host) else '80'}"
 
 
@@ -170,7 +176,7 @@ _Name = Annotated[str, Meta(max_length=1024)]
 
 
 class _Message(msgspec.Struct, tag_field="type", forbid_unknown_fields=True):
-    """Base class of the messages that the viewer accepts from a page. All others are refused, e.g. file uploads."""
+    """Base class of the messages that the viewer accepts from a page. Other messages are refused, e.g. file uploads."""
 
 
 class ViewerCameraMessage(_Message):
@@ -224,8 +230,9 @@ _DECODER = msgspec.msgpack.Decoder(_KINDS)
 
 
 class ViewerConnection(websocket_server.ServerConnection):
-    """WebSocket connection that drops every message for which ``check_message`` returns a reason, and then calls
-    ``on_refusal(self, reason)``.
+    """WebSocket connection that drops invalid messages.
+
+    A message is invalid if ``check_message`` returns a reason. The connection then calls ``on_refusal(self, reason)``.
     """
 
     def __init__(
@@ -361,7 +368,7 @@ class ViewerServer:
 
 
 def _free_viewer_port(host: str, port: int) -> int:
-    """Return ``port``, or any free port if it is 0; ConfigError if ``port`` is in use."""
+    """Return ``port``, or any free port if ``port`` is 0; ConfigError if ``port`` is in use."""
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         family, kind, number, _, address = found[0]

@@ -43,7 +43,7 @@ class RenderQueue:
     """Queue of jobs: functions that use the model, e.g. to render an image.
 
     A new job replaces a waiting job with the same key, so a moving camera causes no backlog. All methods are
-    thread-safe. Only one thread may use the model; it calls :meth:`work` to run the jobs.
+    thread-safe. Only one thread may use the model; this thread calls :meth:`work` to run the jobs.
     """
 
     def __init__(self) -> None:
@@ -65,7 +65,8 @@ class RenderQueue:
             run: function that does the work.
             on_error: called with the exception that ends the job.
             delay: seconds to wait before the job may run.
-            replace: whether to replace a waiting job with the same key. If not, the new job is dropped.
+            replace: whether the new job replaces a waiting job with the same key. If False, the new job is dropped
+                when such a job waits.
         """
         with self._changed:
             if replace or key not in self._jobs:
@@ -83,7 +84,10 @@ class RenderQueue:
         return bool(self._jobs)
 
     def work(self, timeout: float) -> bool:
-        """Run one job whose delay has passed; wait up to ``timeout`` seconds for one. Return whether a job ran."""
+        """Run one job whose delay has passed; return whether a job ran.
+
+        If there is no such job yet, wait up to ``timeout`` seconds for a job.
+        """
         job = self._take(timeout)
         if job is None:
             return False
@@ -94,7 +98,7 @@ class RenderQueue:
         return True
 
     def _take(self, timeout: float) -> _Job | None:
-        """Remove and return the waiting job whose delay passed first; None if none is due within ``timeout``."""
+        """Remove and return the job whose delay passed first; None if no delay passes within ``timeout`` seconds."""
         end = time.monotonic() + timeout
         with self._changed:
             while True:
@@ -108,9 +112,9 @@ class RenderQueue:
 
 
 def next_resolution(resolution: float, seconds: float) -> float:
-    """Return the factor on the resolution of the next image during motion, at most 1.
+    """Return the factor, at most 1, on the resolution of the next image during motion.
 
-    It follows from the factor (``resolution``) and the render time of the last image.
+    ``resolution`` is the factor of the last image, and ``seconds`` the time that rendering the last image took.
     """
     if seconds > _SMOOTH_SECONDS:
         return max(resolution / 2, _MIN_RESOLUTION)
@@ -190,7 +194,7 @@ class Session:
         self.redraw()
 
     def close(self) -> None:
-        """Drop the waiting jobs of the page, which was closed."""
+        """Mark the page as closed and drop its waiting jobs."""
         self.closed = True
         self.queue.drop_client(self.client.client_id)
 
@@ -215,7 +219,7 @@ class Session:
     def set_camera(self, pose: ViewerPose) -> None:
         """Move the page's camera to ``pose``.
 
-        Dragging then turns it around the point of its viewing axis that is closest to the scene's centre.
+        Dragging then turns the camera around the point of the viewing axis that is closest to the scene's centre.
         """
         forward = pose.rotation[:, 2]
         offset = self.scene.center - pose.position
@@ -250,14 +254,14 @@ class Session:
         self.queue.submit((self.client.client_id, kind), run, self.report_error, delay, replace)
 
     def redraw(self) -> None:
-        """Queue an image at a resolution that keeps motion smooth, and one at full resolution when changes stop."""
+        """Queue an image at a resolution that keeps motion smooth. A full image follows when changes stop."""
         self.submit("picture", self._draw_fast)
 
     def draw(self, full: bool = False) -> bool:
         """Render an image and send it to the page. Only call this on the thread that may use the model.
 
         Args:
-            full: render at full resolution, instead of one that keeps motion smooth.
+            full: render at full resolution. If False, render at a resolution that keeps motion smooth.
 
         Returns:
             Whether the image had full resolution.

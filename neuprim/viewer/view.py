@@ -1,8 +1,8 @@
 """Browser viewers of a finished run (``neuprim view``) and of a running training.
 
 During a training, images are rendered between two training steps, on the training thread. The trained model is
-bit-identical to one trained without a viewer. Rendering time does not count towards the training budget. Without open
-pages the viewer only checks its queue of jobs once per training step.
+bit-identical to a model trained without a viewer. Rendering time does not count towards the training budget. While no
+page is open, the viewer only checks its queue of jobs once per training step.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ class LiveTraining:
     def __init__(
         self, settings: ViewerSettings, config: RunConfig, on_open: Callable[[str], None], events: Events
     ) -> None:
-        """Start the server; call ``on_open`` with its address. Every event is also passed to ``events``."""
+        """Start the server; call ``on_open`` with the address of the page. ``events`` also gets every event."""
         self.config, self.events = config, events
         self.queue, self.progress, self.paused = RenderQueue(), TrainingProgress(), False
         self._steps, self._save, self._stop = 0, False, False
@@ -194,7 +194,7 @@ class LiveTraining:
         self.paused = paused
 
     def step_once(self) -> None:
-        """Run one training step while the training is paused."""
+        """Pause the training, then let it run one step."""
         self.pause(True)
         self._steps += 1
 

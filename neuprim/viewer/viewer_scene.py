@@ -57,7 +57,10 @@ class Viewpoint:
 
 
 class Picture(NamedTuple):
-    """A rendered image, (H, W, 3) uint8 sRGB, with a caption that explains its colours (or "") and its render time."""
+    """A rendered image, (H, W, 3) uint8 sRGB, its caption, and the render time in seconds.
+
+    The caption explains the colours of the image; "" if they need no explanation.
+    """
 
     image: np.ndarray
     caption: str
@@ -127,7 +130,7 @@ class ViewerScene:
 
     @cached_property
     def view_indices(self) -> Mapping[str, int]:
-        """Dict of the held-out views with a pinhole camera: name -> index in the test split. Empty without data."""
+        """Held-out views with a pinhole camera: name -> index in the test split. Empty without a data set."""
         if self.dataset is None:
             return {}
         views = self.dataset.test
@@ -139,7 +142,7 @@ class ViewerScene:
         return self.dataset.test.view(self.view_indices[name])
 
     def compare_view(self, name: str) -> tuple[np.ndarray, np.ndarray, float]:
-        """Render a held-out view and compare it with its ground truth, like ``metrics.json``.
+        """Render a held-out view and compare the image with the ground truth, as for ``metrics.json``.
 
         Returns:
             Ground truth and rendering, (H, W, 3) uint8 sRGB, and the PSNR of the rendering in dB.
@@ -153,7 +156,7 @@ class ViewerScene:
 
     @cached_property
     def start_view(self) -> View:
-        """View with which a page opens: the held-out view with most contrast; without data, a view from the side."""
+        """View with which a page opens: the held-out view with most contrast, else a view from the side."""
         if self.dataset is not None:
             views = held_out_webpage_views(self.dataset, self.channels, _START_CANDIDATES, truths=False)
             if views:
@@ -232,7 +235,7 @@ class FrameEllipsoids(NamedTuple):
     Attributes:
         rows: (M,) indices of the primitives in the model.
         positions, scales: (M, 3) centres and (M, 3) semi-axes of the ellipsoids.
-        wxyz: (M, 4) unit quaternions of their orientations.
+        wxyz: (M, 4) unit quaternions of the ellipsoids' orientations.
         colours: (M, 3) uint8 sRGB, colours at the centres, seen from the viewpoint's camera.
     """
 
@@ -246,7 +249,10 @@ class FrameEllipsoids(NamedTuple):
 def list_viewer_ellipsoids(
     model: Primitives, viewpoint: Viewpoint, channels: Channels, limit: int, row: int | None = None
 ) -> FrameEllipsoids:
-    """Return the ellipsoids of the ``limit`` primitives that absorb most light; with ``row``, only of this one."""
+    """Return the ellipsoids of the ``limit`` primitives that absorb most light.
+
+    If ``row`` is given, return only the ellipsoid of the primitive with this index, or none if it is not active.
+    """
     with torch.no_grad():
         lowered = model.lower(viewpoint.camera, viewpoint.conditions)
         geometry = lowered.geometry

@@ -1,4 +1,4 @@
-"""Make one HTML file that shows a model. It has the parameters, cameras and images, and the scripts that render."""
+"""Make one HTML file that shows a model. The file has the model's parameters, cameras, images and rendering scripts."""
 
 from __future__ import annotations
 
@@ -94,7 +94,8 @@ class WebPage:
     Attributes:
         text: content of the HTML file.
         model: the model with the parameter values that the page stores.
-        nonce: nonce of the page's scripts in its content security policy; a page that embeds this page must allow it.
+        nonce: random text that marks the page's own scripts in its content security policy. A page that embeds this
+            page must allow the same nonce.
     """
 
     text: str
@@ -186,7 +187,7 @@ def _field_script(kind: str, field: Field) -> str:
 
 
 def held_out_webpage_views(dataset: Dataset, channels: Channels, limit: int, truths: bool = True) -> list[PageView]:
-    """Return up to ``limit`` held-out views of pinhole cameras, evenly spread; the one with most contrast first.
+    """Return up to ``limit`` evenly spread held-out views of pinhole cameras; the view with most contrast is first.
 
     Args:
         truths: whether the views hold their ground truth.
@@ -208,8 +209,9 @@ def held_out_webpage_views(dataset: Dataset, channels: Channels, limit: int, tru
 def initial_webpage_conditions(
     specs: Sequence[ConditionSpec], views: Sequence[PageView], given: Mapping[str, Tensor]
 ) -> list[Condition]:
-    """Return the initial value of each condition, float64: the given value, else the first view's value, else the
-    middle of a bounded range, else 1.
+    """Return the initial value of each condition, float64.
+
+    The value is that in ``given``, else that of the first view, else the middle of a bounded range, else 1.
     """
     shown = {**(views[0].conditions if views else {}), **given}
     found = []
@@ -255,7 +257,10 @@ def scene_page(
 
 
 def stored_up_axis(header: Mapping[str, Any]) -> tuple[float, ...]:
-    """Return the upward direction (3,) in a model's header; +z unless it has three finite numbers, not all 0."""
+    """Return the upward direction (3,) in a model's header; +z if the header has no valid direction.
+
+    A valid direction has three finite numbers that are not all 0.
+    """
     data = header.get("data")
     up = data.get("up") if isinstance(data, Mapping) else None
     if not isinstance(up, list) or len(up) != 3 or not all(isinstance(x, int | float) and math.isfinite(x) for x in up):
@@ -264,8 +269,9 @@ def stored_up_axis(header: Mapping[str, Any]) -> tuple[float, ...]:
 
 
 def fullest_webpage_conditions(model: Primitives, conditions: Sequence[Condition]) -> dict[str, Tensor]:
-    """Return the initial values of the conditions, e.g. the time. If no primitive is active at these values, change one
-    condition so that as many primitives as possible are active.
+    """Return the initial values of the conditions, e.g. the time, changed if no primitive is active at these values.
+
+    In that case, one scalar condition is changed so that as many primitives as possible are active.
     """
     start = {condition.spec.name: condition.value for condition in conditions}
     if model.active(start).geometry.count:
@@ -283,7 +289,7 @@ def fullest_webpage_conditions(model: Primitives, conditions: Sequence[Condition
 def _measure_webpage_extent(model: Primitives, conditions: Mapping[str, Tensor]) -> tuple[list[float], float, float]:
     """Return centre and radius of a sphere around 98 % of the active primitives, and a typical extinction.
 
-    The latter is the 95 % quantile of the extinction at the centres of the primitives.
+    The typical extinction is the 95 % quantile of the extinctions at the centres of the primitives.
     """
     active = model.active(conditions)
     if not active.geometry.count:
@@ -303,8 +309,10 @@ def _make_webpage_camera(middle: Sequence[float], radius: float, up: Sequence[fl
 
 
 def webpage_camera_numbers(camera: Camera) -> dict[str, Any]:
-    """Return a camera in the form of the page's scripts: rotation R (row by row) and translation t from world to
-    camera, OpenCV axes, and intrinsics and image size in pixels.
+    """Return a camera as JSON-ready values for the page's scripts.
+
+    "R" (row by row) and "t" are rotation and translation from world to camera, OpenCV axes. The other values are
+    intrinsics and image size in pixels.
     """
     view = camera.viewmat.detach().double().cpu()
     numbers = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy", "width", "height")}
@@ -342,9 +350,9 @@ _QUADRATURE_POINTS = 16  # for chords that the near plane cuts; with 8 of them e
 def shader_constants(edge: int) -> dict[str, list[float]]:
     """Return constants of the page's shader: coefficients of polynomials in z = v^2, and a Gauss-Legendre rule.
 
-    The polynomials, highest power first, approximate functions of v for |v| <= 1/2: "cos" is cos(2 pi v), "sinc" is
+    Each polynomial, highest power first, approximates a function of v for |v| <= 1/2. "cos" is cos(2 pi v), "sinc" is
     sin(2 pi v)/(2 pi v), and "edge" is B_p(2 pi v) of :mod:`neuprim.core.model.edge` for p = ``edge``. "nodes" and
-    "weights" are the positive half of the quadrature rule.
+    "weights" are the Gauss-Legendre rule's nodes above 0 and their weights; the rule is symmetric.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
     turn = 2 * math.pi
@@ -372,7 +380,7 @@ class PackedModel(NamedTuple):
 
     Attributes:
         parts: encoding of each parameter, in the order of ``data``.
-        data: byte planes of all parameters, gzipped.
+        data: gzipped byte planes of all parameters; a byte plane has one byte of every primitive.
         model: the model that decoding gives.
     """
 
@@ -382,7 +390,7 @@ class PackedModel(NamedTuple):
 
 
 def pack_webpage_model(model: Primitives, level: int) -> PackedModel:
-    """Pack all parameters for a page: exactly at level 0, else quantised as by ``neuprim compress --level`` 1 to 5.
+    """Pack all parameters for a page: exact at level 0, quantised at levels 1 to 5 like ``neuprim compress --level``.
 
     Raises:
         ConfigError: the level does not exist.

@@ -75,7 +75,7 @@ def test_a_group_is_taken_out_of_the_overrides(take: Take, words: list[str], exp
             ["target.psnr=30"],
             "target.psnr=30: expected a budget, the time for search and training",
         ),
-        (take_target_overrides, [BUDGET], "budget=10m: no target; expected one of target.psnr=DB, target.ssim=S"),
+        (take_target_overrides, [BUDGET], "budget=10m: no target given; expected one of target.psnr=DB, target.ssim=S"),
         (take_target_overrides, ["target=30", BUDGET], "target=30: expected one of target.psnr=DB"),
         (take_target_overrides, ["target.psnr=-3", BUDGET], "target.psnr=-3: expected decibels, above 0"),
         (take_target_overrides, ["target.psnr=28,30", BUDGET], "target.psnr: several values; expected one"),

@@ -59,7 +59,7 @@ def test_relighting_takes_rgb_only(channels: int) -> None:
     """A light's intensity has three numbers."""
     with pytest.raises(
         ConfigError,
-        match=f"^conformance example: {channels} colour channels; task relight expects 3, like light_intensity",
+        match=f"^conformance example: images have {channels} colour channels; task relight expects 3, because lights",
     ):
         TaskUnderTest(RELIGHT).with_channels(channels).build_fields()
 

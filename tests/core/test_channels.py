@@ -84,7 +84,9 @@ def test_a_data_set_must_have_the_channels_that_its_task_names() -> None:
     dataset = tiny.two_primitives()
     assert find_channels(TASK, dataset).names == ("R", "G", "B")
     assert find_channels(replace(TASK, channels=("a", "b", "c")), dataset).names == ("a", "b", "c")
-    with pytest.raises(DataError, match=r"^two: 3 channels; expected 5, the channels of task 'static': 450nm, 550 nm"):
+    with pytest.raises(
+        DataError, match=r"^two: images have 3 channels; expected 5, the channels of task 'static': 450nm, 550 nm"
+    ):
         find_channels(replace(TASK, channels=BANDS), dataset)
     with pytest.raises(
         DataError, match=r"^two: the background has shape \(3,\); expected \(5,\), one number per channel"

@@ -75,7 +75,10 @@ def test_words_that_mean_nothing_are_refused(run_dir: Path, capsys: pytest.Captu
         ),
         (["--format", "npz", "time"], "time: no such argument of `neuprim export`"),
         (["--format", "mesh", "grid=9", "grid=9"], "twice"),
-        (["--format", "npz", "--wavelength-shift", "1"], "--wavelength-shift: --format npz takes no conditions"),
+        (
+            ["--format", "npz", "--wavelength-shift", "1"],
+            "--wavelength-shift: --format npz takes no conditions; leave out --wavelength-shift",
+        ),
         (["--format", "vdb", "--wavelength-shift=1", "--wavelength-shift", "1"], "wavelength-shift: given twice"),
         (["--format", "vdb", "wavelength-shift=1"], "did you mean '--wavelength-shift'"),
         (["--format", "vdb", "--wavelength-shift"], "--wavelength-shift: expected a value after it"),
@@ -101,7 +104,7 @@ def test_an_exporter_that_calls_no_helper_replaces_nothing(
     path.write_text("precious")
     before = entries(tmp_path)
     assert call(*words) == 2
-    assert f"{path}: exists; --force replaces it" in one_line(capsys) and path.read_text() == "precious"
+    assert f"{path}: already exists; pass --force to replace it" in one_line(capsys) and path.read_text() == "precious"
     assert call(*words, "--force") == 0 and len(json.loads(path.read_text())) == 5
     assert entries(tmp_path) == before
 
@@ -166,7 +169,7 @@ def test_suffixes_are_checked_before_anything_is_done(site: Path, run_dir: Path,
         export_run(run_dir, "centres")
     (run_dir / "export").mkdir()
     (run_dir / "export" / "centres.json").touch()
-    with pytest.raises(ConfigError, match=r"export/centres\.json: exists"):
+    with pytest.raises(ConfigError, match=r"export/centres\.json: already exists"):
         export_run(run_dir, "centres")
 
 
@@ -181,7 +184,7 @@ def test_pictures_of_inspect_are_not_replaced(
     ):
         (tmp_path / taken).write_text("precious")
         assert call(*words, tmp_path / name, *more) == 2
-        assert f"{taken}: exists; --force replaces it" in one_line(capsys)
+        assert f"{taken}: already exists; pass --force to replace it" in one_line(capsys)
         assert sorted(p.name for p in tmp_path.glob("*.*")) == [taken] and (tmp_path / taken).read_text() == "precious"
         assert call(*words, tmp_path / name, *more, "--force") == 0
         assert (tmp_path / taken).stat().st_size > 100

@@ -183,7 +183,7 @@ def test_eight_bits_keep_thin_matter_and_zero() -> None:
         (["--show", "difference", "--out", "x.html"], "no ground truth; give --against"),
         (["--against", "nowhere", "--out", "x.vdb"], "no such file or folder"),
         (["--primitive", "2", "--out", "x.html"], "the model has 2 primitives, 0 to 1"),
-        (["--grid", "9999", "--out", "x.vdb"], "expected at most 1024"),
+        (["--grid", "9999", "--out", "x.vdb"], "expected at most 1024 points per side"),
         (["--box=0,0", "--out", "x.vdb"], "lower and the upper corner"),
         (["--box=0,0,0,1,1,-1", "--out", "x.vdb"], "lower and the upper corner"),
         (["--time", "2", "--out", "x.vdb"], "expected a time from 0 to 1"),

@@ -165,8 +165,8 @@ SUM = "density field TwoScales: lower: sum of two Cosine forms: the first form: 
             "scene",
             "(index * 0.37) % 1.0",
             "index * 0.37",
-            "scene 'ball' of neuprim-spectral 0.1: train view 3 (view3): condition 'wavelength_shift' holds 1.11; "
-            "expected 0 to 1, its range",
+            "scene 'ball' of neuprim-spectral 0.1: train view 3 (view3): condition 'wavelength_shift' is 1.11; "
+            "expected 0 to 1, the range of this condition",
         ),
     ],
 )

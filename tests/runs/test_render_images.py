@@ -145,7 +145,7 @@ def test_lights_apart_add_up_to_the_beauty(tmp_path: Path) -> None:
     whole = render_light_sum(model, replace(VIEW, conditions={}), lights, RenderSettings(), BLUE)
     over, _ = written(tmp_path / "b.exr", replace(how, names="beauty"), model, replace(VIEW, conditions={}))
     assert (rgb(over) - whole).abs().max() < 1e-5
-    with pytest.raises(ConfigError, match="--layers lights: 129 lights, one layer each; expected at most 128"):
+    with pytest.raises(ConfigError, match="--layers lights: 129 lights need one layer each; expected at most 128"):
         replace(how, lights=lights * 43)
 
 

@@ -368,7 +368,8 @@ def test_a_picture_of_the_report_is_replaced_only_where_that_is_said(
     words_of_film = ["render", str(out), "--camera", "orbit", "--frames", "2"]
     over = ["--out", str(out / "renders" / ".." / "renders" / "orbit.webp")]
     assert main([*words_of_film, *over]) == 2
-    assert "orbit.webp: is a picture of the run's report; --force replaces it, --out PATH" in capsys.readouterr().err
+    refusal = "orbit.webp: is a picture of the run's report; pass --force to replace it, or --out PATH to write"
+    assert refusal in capsys.readouterr().err
     assert main([*words_of_film, "--format", "webp"]) == 0 and (out / "frames" / "orbit.webp").exists()
     assert film.read_bytes() == before
     assert main([*words_of_film, *over, "--force"]) == 0

@@ -123,8 +123,12 @@ def test_an_animation(run: Path, cameras: Path, tmp_path: Path) -> None:
     [
         (["--shutter", "0"], "'0': expected a part of the frame interval, above 0 and at most 1"),
         (["--shutter", "1.5"], "'1.5': expected a part of the frame interval, above 0 and at most 1"),
-        (["--shutter-samples", "4"], "--shutter-samples: found without --shutter; expected both"),
-        (["--shutter", "0.5"], "--shutter 0.5: all images show one time, and the model has no numbered frames"),
+        (["--shutter-samples", "4"], "--shutter-samples: needs --shutter, too; pass for example --shutter 0.5"),
+        (
+            ["--shutter", "0.5"],
+            "--shutter 0.5: the frame interval is unknown: all images show one time, and the model has no numbered "
+            "frames",
+        ),
     ],
 )
 def test_wrong_shutters_are_refused(

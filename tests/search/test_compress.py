@@ -108,7 +108,7 @@ def test_wrong_words(whole: Path, capsys: pytest.CaptureFixture[str], more: list
 def test_a_file_in_the_way_stays(whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "m.neuprim"
     out.write_bytes(b"mine")
-    with pytest.raises(ConfigError, match="exists; --force replaces it"):
+    with pytest.raises(ConfigError, match="already exists; pass --force to replace it"):
         compress_run(whole, level=3, out=out)
     with pytest.raises(ConfigError, match="is a folder"):
         compress_run(whole, level=3, out=tmp_path)

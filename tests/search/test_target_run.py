@@ -210,7 +210,10 @@ def test_settings_that_a_target_decides_are_refused(more: list[str], message: st
 
 
 def test_what_cannot_be_searched_is_refused(met: Met, tmp_path: Path) -> None:
-    expected = r"budget=20s: enough for \d+ steps of 40 primitives; expected at least 256 steps. Give a budget of \d+ s"
+    expected = (
+        r"budget=20s: enough for only \d+ steps of 40 primitives; expected at least 256 steps. "
+        r"Give a budget of \d+ s"
+    )
     clock = Clock()
     with pytest.raises(ConfigError, match=expected):
         run_target(config(tmp_path / "short"), SearchTarget(psnr=20.0), 20.0, clock.hear, clock)

@@ -65,7 +65,7 @@ def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraV
     if model is not None:
         named, notes = read_colmap_cameras(model)
         if len(named) > MAX_CAMERAS:
-            raise DataError(f"{path}: {len(named)} cameras; expected at most {MAX_CAMERAS}")
+            raise DataError(f"{path}: the model has {len(named)} cameras; expected at most {MAX_CAMERAS}")
         return CameraViews(tuple(named), notes=tuple(notes))
     if path.is_dir():
         found = "is a folder without cameras.txt or cameras.bin"
@@ -103,12 +103,15 @@ def _read_camera_image_size(record: JsonReader, keys: tuple[str, str], size: tup
 
 
 def _read_camera_file_times(records: list[JsonReader], key: str) -> tuple[float, ...] | None:
-    """Return one time per camera, read from field ``key`` of each record; None unless all cameras have a time."""
+    """Return one time per camera, from the field ``key`` of each record; None if a record lacks the field."""
     return tuple(r.number(key, "a time") for r in records) if all(r.has(key) for r in records) else None
 
 
 def _read_camera_frame_rate(document: JsonReader, count: int) -> float | None:
-    """Return the frames per second: field ``fps``, else ``count`` frames / field ``seconds``; None without either."""
+    """Return the frames per second: the field ``fps``, else ``count`` frames divided by the field ``seconds``.
+
+    Returns None if the file has neither field.
+    """
     for key in ("fps", "seconds"):
         if document.has(key):
             value = document.number(key, "a number above 0", 0.0)
@@ -123,7 +126,8 @@ def _read_camera_frames(document: JsonReader, size: tuple[int, int] | None) -> C
     """Read the cameras of a JSON file in the format of ``transforms.json``.
 
     The keys are ``{"w", "h", "camera_angle_x" | "fl_x"[, ...], "frames": [{"transform_matrix", ...}]}``. ``size`` is
-    (width, height) in pixels, for a file without ``w`` and ``h``. A note says if lens distortion is left out.
+    (width, height) in pixels, for a file without ``w`` and ``h``. Lens distortion is left out, and a note of the result
+    says so.
     """
     records, found, bent = _camera_records(document, "frames"), [], 0
     notes: dict[str, None] = {}
@@ -197,12 +201,13 @@ def is_usd(path: Path) -> bool:
 
 
 def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = None) -> CameraViews:
-    """Read one camera of a USD stage: one view per whole time code if the camera moves, else one view.
+    """Read one camera of a USD stage; a moving camera gives one view per time code, in steps of 1.
 
-    ``prim`` is the prim path of the camera, required if the stage has several cameras. Axes and units are those of the
-    stage. ``size`` is (width, height) in pixels; None uses the size in the stage's render settings. The image shows the
-    whole aperture ("expandAperture" of UsdRender). Raises DataError for unreadable stages, orthographic cameras, poses
-    with shear or unequal scales, or if no size is known.
+    ``prim`` is the prim path of the camera, required if the stage has several cameras. The result has the axes and
+    units of the stage. ``size`` is (width, height) in pixels; None uses the size in the stage's render settings. The
+    image shows the whole aperture ("expandAperture" of UsdRender). Raises DataError for unreadable stages, orthographic
+    cameras, poses with shear or unequal scales, or if no size is known. Raises BackendUnavailable if the package
+    usd-core is missing.
     """
     if importlib.util.find_spec("pxr") is None:
         raise BackendUnavailable(f"{path}: USD files need the package usd-core: pip install 'neuprim[usd]'")
@@ -225,9 +230,9 @@ def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = 
 
 
 def _read_usd_stage(path: Path, prim: str) -> JsonReader:
-    """Run ``usd_stage.py`` for camera ``prim`` of a file in a separate process; return the JSON object it prints."""
+    """Return the JSON object that ``usd_stage.py`` prints for camera ``prim`` of a file, run in a separate process."""
     if path.stat().st_size > _MAX_USD_BYTES:
-        raise DataError(f"{path}: {path.stat().st_size} bytes; expected at most {_MAX_USD_BYTES}")
+        raise DataError(f"{path}: the file has {path.stat().st_size} bytes; expected at most {_MAX_USD_BYTES}")
     # -P: pxr must not import modules from the script's folder
     words = [sys.executable, "-P", str(_USD_SCRIPT), str(path.resolve()), prim, str(MAX_CAMERAS)]
     try:
@@ -273,7 +278,7 @@ def _usd_camera(record: JsonReader, size: tuple[int, int]) -> Camera:
 
 
 def _remove_pose_scale(matrix: Tensor, where: str) -> Tensor:
-    """Remove the uniform scale from a (4, 4) camera-to-world pose; raise DataError if the scales of its axes differ."""
+    """Remove the uniform scale from a (4, 4) camera-to-world pose; raise DataError if the axes have unequal scales."""
     lengths = matrix[:3, :3].norm(dim=0)
     mean = lengths.mean()
     if not bool(mean > 0) or float((lengths / mean - 1).abs().max()) > _UNEQUAL_SCALES:

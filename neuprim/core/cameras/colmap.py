@@ -109,7 +109,8 @@ def colmap_viewmat(image: Any) -> Tensor:
 def largest_colmap_model(project: Path) -> tuple[Path | None, str]:
     """Find the COLMAP model with the most images in the folder ``sparse`` of a project.
 
-    Returns the folder of the model, None if there is no model, and a message if there are several models, else "".
+    Returns a pair: the folder of the model (None without any model), and a message for the user (empty unless there are
+    several models).
     """
     place = project / "sparse"
     models = sorted(
@@ -138,7 +139,7 @@ def _count_colmap_images(model: Path) -> int:
 
 
 def find_colmap_model(path: Path) -> Path | None:
-    """Return the folder of the COLMAP model to which ``path`` leads; None if it leads to no model.
+    """Return the folder of the COLMAP model that ``path`` refers to; None if there is no model.
 
     ``path`` may be the folder, a file of the model, or a project: a folder whose subfolder ``sparse`` holds models.
     """
@@ -151,8 +152,9 @@ def find_colmap_model(path: Path) -> Path | None:
 def read_colmap_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[str]]:
     """Return the pinhole cameras of all posed images of a COLMAP model, and messages for the user.
 
-    The cameras are pairs (image name without suffix, camera), sorted by name. Lens distortion is left out, with a
-    message. Raises DataError for a damaged model, an unsupported camera model, or no posed image.
+    A posed image is an image with a known camera pose. The cameras are pairs (image name without suffix, camera),
+    sorted by name. Lens distortion is left out, and a message says so. Raises DataError for a damaged model, an
+    unsupported camera model, or no posed image.
     """
     reconstruction = _read_colmap_cameras_only(folder)
     images = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
@@ -213,7 +215,7 @@ class _ColmapRecordReader:
         """Advance the read position by ``size`` bytes; return the position before, in bytes from the file's start."""
         start, self.at = self.at, self.at + size
         if size < 0 or self.at > len(self.data):
-            found = f"a record ends at byte {self.at}, but the file at byte {len(self.data)}"
+            found = f"a record ends at byte {self.at}, but the file ends at byte {len(self.data)}"
             raise DataError(f"{self.path}: truncated or corrupt: {found}")
         return start
 
@@ -229,8 +231,8 @@ class _ColmapRecordReader:
 def check_binary_colmap_model(folder: Path, parameter_count: Callable[[int], int]) -> None:
     """Check all ``.bin`` files of a model record by record; raise DataError for a damaged file.
 
-    ``parameter_count`` maps COLMAP's number of a camera model to the count of the model's lens parameters; -1 stands
-    for an unknown model.
+    ``parameter_count`` is a function that returns the number of lens parameters of a camera model, given COLMAP's
+    number for this camera model; -1 stands for an unknown model.
     """
     records = (lambda file: _skip_camera(file, parameter_count), _skip_image, _skip_point, _skip_rig, _skip_frame)
     for part, skip_record in zip(_PARTS, records, strict=True):
@@ -241,7 +243,8 @@ def check_binary_colmap_model(folder: Path, parameter_count: Callable[[int], int
         for _ in range(file.number("Q")):
             skip_record(file)
         if file.at != len(file.data):
-            raise DataError(f"{file.path}: corrupt: records end at byte {file.at}, but the file at {len(file.data)}")
+            found = f"records end at byte {file.at}, but the file ends at byte {len(file.data)}"
+            raise DataError(f"{file.path}: corrupt: {found}")
 
 
 def _skip_camera(file: _ColmapRecordReader, parameter_count: Callable[[int], int]) -> None:

@@ -4,13 +4,13 @@ Focal lengths: ``fl_x fl_y`` in pixels, ``camera_angle_x camera_angle_y`` in rad
 ``camera_intrinsics`` [cx, cy, fx, fy]. Principal point: ``cx cy``. Size: ``w h``. Lens: ``camera_model``,
 ``is_fisheye``, ``k1 k2 k3 k4 p1 p2``.
 
-A *record* is the JSON object of a frame or of the whole file. A *group* is the keys for the focal length, the
-principal point, the lens model or the distortion.
+A *record* is the JSON object of a frame or of the whole file. A *group* is a set of keys with one purpose: the focal
+length, the principal point, the lens model or the distortion.
 
-* All keys of a group come from the frame if it has any of them, else from the file.
+* All keys of a group come from the frame if the frame has any key of the group, else from the file.
 * Keys of one record that state the same quantity must agree within 1 %.
-* Lengths in pixels refer to the image size in their own record. They are scaled if the image is a resized copy.
-* A key that changes the image, and that neuprim cannot apply, raises a DataError. Unknown keys are listed in a warning.
+* Lengths in pixels refer to the image size in their own record. Lengths are scaled if the image is a resized copy.
+* A DataError reports a key that changes the image and that neuprim cannot apply. A warning lists unknown keys.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class CameraTarget:
 
 @dataclass(frozen=True)
 class _IntrinsicsSource:
-    """A JSON object with intrinsics (a frame or the whole file), and the image size for which its lengths hold."""
+    """A record with intrinsics (a frame or the whole file), and the image size to which the record's lengths refer."""
 
     record: JsonReader
     size: tuple[int, int]
@@ -66,7 +66,8 @@ class _IntrinsicsSource:
     def scales(self, keys: str, target: CameraTarget) -> tuple[float, float]:
         """Return (x, y) factors that convert lengths from pixels of this record to pixels of the target image.
 
-        ``keys`` names the lengths in errors. Raises DataError unless the target is a resized copy of this image size.
+        ``keys`` names the lengths in errors. Raises DataError unless this record's image size and the target image have
+        the same aspect ratio.
         """
         if not is_resized_camera_size(self.size, target.size):
             own, other = _format_camera_image_size(self.size), _format_camera_image_size(target.size)
@@ -87,7 +88,7 @@ def is_resized_camera_size(size: tuple[int, int], other: tuple[int, int]) -> boo
 
 
 def _record_with_camera_keys(group: tuple[str, ...], frame: JsonReader, file: JsonReader) -> JsonReader:
-    """Return the JSON object from which to read a group of keys: the frame if it has any of them, else the file."""
+    """Return the record that has the keys of a group: the frame if it has any key of the group, else the file."""
     return frame if any(frame.has(key) for key in group) else file
 
 
@@ -100,9 +101,10 @@ def read_camera(
 ) -> Camera:
     """Read the pinhole camera of a frame; keys that the frame lacks are read from ``file``.
 
-    ``file`` is the JSON object of the whole file, ``target`` the image of the camera. ``viewmat`` (4, 4) is world to
-    camera, OpenCV axes; None reads ``transform_matrix``. ``say`` is called with messages for the user. Raises DataError
-    for missing or wrong fields, or fields that contradict each other or the size of the image.
+    ``file`` is the JSON object of the whole file, ``target`` the image of the camera. ``viewmat`` (4, 4) is the
+    world-to-camera matrix, OpenCV axes; None reads the field ``transform_matrix``. The function calls ``say`` with
+    messages for the user. Raises DataError for missing or wrong fields, or fields that contradict each other or the
+    size of the image.
     """
     of_file = _IntrinsicsSource(file, _stated_image_size(file, target.size))
     of_frame = _IntrinsicsSource(frame, _stated_image_size(frame, of_file.size))
@@ -134,7 +136,10 @@ def _stated_image_size(record: JsonReader, default: tuple[int, int]) -> tuple[in
 def _read_focal_lengths(
     frame: JsonReader, level: _IntrinsicsSource, target: CameraTarget, say: Say
 ) -> tuple[float, float]:
-    """Return (fx, fy) in target pixels from ``level``, the frame or the file; raise DataError if keys disagree."""
+    """Return (fx, fy) in pixels of the target image, from the record ``level``, which is the frame or the file.
+
+    Raises DataError for missing, contradictory or implausible focal lengths.
+    """
     x, y = _stated_camera_focal_lengths(level, 0, target), _stated_camera_focal_lengths(level, 1, target)
     if not x and not y:
         keys = "camera_angle_x (radians), fl_x (pixels), camera_intrinsics or x_fov (degrees)"
@@ -178,7 +183,7 @@ def _read_focal_lengths(
 
 
 def _stated_camera_focal_lengths(level: _IntrinsicsSource, axis: int, target: CameraTarget) -> dict[str, float]:
-    """Return the focal length along ``axis`` (0: x, 1: y), by the name of each key that states it.
+    """Return key -> focal length, for each key of a record that states the focal length along ``axis`` (0: x, 1: y).
 
     Focal lengths are in pixels of the target image. Keys in pixels come before keys that state a field of view.
     """
@@ -218,7 +223,10 @@ def _focal_lengths_agree(a: float, b: float) -> bool:
 def _read_principal_point(
     frame: _IntrinsicsSource, file: _IntrinsicsSource, focal: _IntrinsicsSource, target: CameraTarget
 ) -> tuple[float, float]:
-    """Return the principal point in target pixels, by default the image centre; ``focal`` states the focal lengths."""
+    """Return the principal point in pixels of the target image; without any key, it is the image centre.
+
+    ``focal`` is the record that states the focal lengths, ``frame`` or ``file``.
+    """
     array = focal.record.has("camera_intrinsics")
     level = frame if frame.has(PRINCIPAL_POINT) else focal if array else file
     array = array and level is focal
@@ -247,8 +255,9 @@ def _check_principal_point(
 ) -> None:
     """Raise DataError for an implausible principal point (cx, cy) in pixels of the target image.
 
-    A point is implausible if it lies outside the image or is a fraction of the image size. If no image size is
-    ``stated``, so is the centre of an image of another size. Errors name the JSON object ``where`` and its ``keys``.
+    A point is implausible if it lies outside the image, or if its values are fractions of the image size. ``stated``
+    says whether the file states an image size. If not, a point that is the centre of an image of another size is
+    implausible, too. Errors name the JSON object ``where`` and its ``keys``.
     """
     (cx, cy), image = point, f"{target.image or 'the picture'} ({target.width}x{target.height})"
     kx, ky = 2.0 * cx / target.width, 2.0 * cy / target.height
@@ -269,9 +278,10 @@ def _check_principal_point(
 
 
 def _check_one_lens(frame: _IntrinsicsSource, file: _IntrinsicsSource, target: CameraTarget) -> None:
-    """Raise DataError if a frame's focal length differs from that of the file, which gives the rest of the lens.
+    """Raise DataError if a frame mixes its own focal length with lens keys of the file for another focal length.
 
-    The rest is the principal point and the distortion. An image centre and zero coefficients are accepted.
+    The lens keys are the principal point and the distortion coefficients. A principal point at the image centre and
+    zero coefficients fit every focal length, so they raise no error.
     """
     if file.record.has("camera_intrinsics") or not file.has(FOCAL):
         return
@@ -296,7 +306,10 @@ def _check_one_lens(frame: _IntrinsicsSource, file: _IntrinsicsSource, target: C
 
 
 def read_lens_coefficients(frame: JsonReader, file: JsonReader) -> dict[str, float]:
-    """Return k1 to k4, p1, p2 by name: those of the frame if it has any, else those of the file; 0 for missing ones."""
+    """Return the distortion coefficients k1 to k4, p1, p2 by name; a missing coefficient is 0.
+
+    If the frame has any coefficient, all coefficients come from the frame, else from the file.
+    """
     record = _record_with_camera_keys(COEFFICIENTS, frame, file)
     return {key: record.number_or(key, 0.0) for key in COEFFICIENTS}
 
@@ -359,7 +372,7 @@ _REFUSED = {
     "normal_mts_args": "Mitsuba's axes; expected OpenGL's, x right, y up, z backward",
     "driver_parameters": "a light of its own in every frame; expected task=relight scene=olat, with pl_pos",
 }
-"""Unsupported keys that change the image if they are set -> what each key describes, for the error message."""
+"""Map from each unsupported key that changes the image to what the key describes, for the error message."""
 
 _KINDS = ("camera_type", "lens_model", "distortion_model", "projection")
 _ELSEWHERE = {"time": "task=dynamic scene=multiview reads it", "pl_pos": "task=relight scene=olat reads it"}
@@ -386,7 +399,10 @@ def _is_camera_key_set(value: Any) -> bool:
 
 
 def describe_unknown_camera_keys(file: JsonReader, frames: Iterable[JsonReader], read: Iterable[str]) -> str:
-    """Return a warning with all keys that are neither known nor in ``read``, the loader's own keys; "" without any."""
+    """Return a warning that lists unknown keys; "" if there are none.
+
+    ``read`` are the keys that the loader itself reads, in addition to the keys of this module.
+    """
     known = _READ | _HARMLESS | _REFUSED.keys() | {*_KINDS, *read}
     found = dict.fromkeys(k for k in file.values if k not in known)
     found.update(dict.fromkeys(f"frames[].{k}" for r in frames for k in r.values if k not in known))

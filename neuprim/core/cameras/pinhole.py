@@ -1,4 +1,4 @@
-"""Pinhole cameras, and other central projections that are given as one ray direction per pixel.
+"""Pinhole cameras, and other central projections, which are stored as one ray direction per pixel.
 
 Camera axes are OpenCV's (x right, y down, z forward). View matrices are world to camera. Pixel centres are at +0.5.
 """
@@ -49,7 +49,7 @@ class Camera:
         return Camera(self.viewmat, fx, fy, cx, cy, self.width // factor, self.height // factor)
 
     def strided(self, stride: int, column: int, row: int) -> Camera:
-        """Return the camera whose rays are those of every ``stride``-th pixel in x and y, from (column, row) on."""
+        """Return a camera with the rays of every ``stride``-th pixel in x and y, from the pixel (column, row) on."""
         cx, cy = ((c - first - 0.5) / stride + 0.5 for c, first in ((self.cx, column), (self.cy, row)))
         width, height = -(-(self.width - column) // stride), -(-(self.height - row) // stride)
         return Camera(self.viewmat, self.fx / stride, self.fy / stride, cx, cy, width, height)
@@ -70,7 +70,7 @@ class Camera:
         numbers = torch.tensor([self.fx, self.fy, self.cx, self.cy], dtype=torch.float64)
         if not (torch.isfinite(numbers).all() and self.fx > 0 and self.fy > 0):
             found = f"intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}"
-            raise DataError(f"{where}: {found}; expected finite numbers, focal lengths > 0")
+            raise DataError(f"{where}: {found}; expected finite numbers and focal lengths above 0")
         if self.width <= 0 or self.height <= 0:
             raise DataError(f"{where}: image size {self.width}x{self.height}; expected positive numbers")
         check_viewmat(self.viewmat, where)
@@ -130,9 +130,10 @@ def horizontal_axes(up: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def orbit(template: Camera, center: Tensor, up: Tensor, radius: float, elevation: float, count: int) -> list[Camera]:
-    """Return ``count`` copies of ``template`` on a circle around ``center``, all looking at ``center``.
+    """Return ``count`` copies of the camera ``template`` on a circle, all looking at ``center``.
 
-    ``radius`` is their distance from ``center``. ``elevation`` is their angle above the horizontal plane, in radians.
+    ``radius`` is the distance of the cameras from ``center``, in scene units. ``elevation`` is the angle of the cameras
+    above the plane through ``center`` at right angles to ``up``, in radians.
     """
     up = (up / up.norm()).double()
     a, b = horizontal_axes(up)
@@ -165,9 +166,9 @@ def camera_exr_attributes(camera: Camera, near: float) -> dict[str, Any]:
     """Return header attributes, by name, that describe a camera in an OpenEXR file.
 
     The standard attributes are ``worldToCamera``, ``worldToNDC``, ``screenWindowCenter`` and ``screenWindowWidth``. The
-    matrices multiply row vectors, in a left-handed space with y up and z forward; device coordinates run from (0, 0) at
-    the upper left to (1, 1). neuprim adds ``neuprim:worldToCamera`` in float64, ``neuprim:focalLength`` and
-    ``neuprim:principalPoint`` (x, y, pixels), and ``neuprim:near``, the depth of the near plane.
+    matrices multiply row vectors. Camera space is left-handed, with y up and z forward. Device coordinates (NDC) run
+    from (0, 0) at the upper left to (1, 1). neuprim adds ``neuprim:worldToCamera`` in float64, ``neuprim:focalLength``
+    and ``neuprim:principalPoint`` (x, y, pixels), and ``neuprim:near``, the depth of the near plane.
     """
     view = camera.viewmat.detach().double().cpu().numpy()
     up = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -201,10 +202,10 @@ _UNIT = 1e-6  # how far from 1 a direction's length may be: float32 rounding pas
 class RayCamera:
     """A camera with one ray direction per pixel, such as a fisheye or a panorama.
 
-    Only the backend ``reference`` renders it. All rays start at one point; they may point backwards (z < 0). The near
-    distance, depth images and the order of primitives use distances along the rays, where a pinhole uses depths along
-    z. So the image differs from a pinhole's where the near distance cuts a primitive. Raises DataError if ``viewmat``
-    is not a rotation and a translation, or directions are not of unit length.
+    Only the backend ``reference`` renders a RayCamera. All rays start at one point; rays may point backwards (z < 0).
+    The near distance, depth images and the order of primitives use distances along the rays, whereas a :class:`Camera`
+    uses depths along z. So the two kinds of camera give different images where the near distance cuts a primitive.
+    Raises DataError if ``viewmat`` is not a rotation and a translation, or directions are not of unit length.
     """
 
     viewmat: Tensor  # (4, 4) world to camera, OpenCV axes
@@ -240,7 +241,7 @@ class RayCamera:
         """Return a fisheye camera whose shorter image side spans ``fov_degrees``, at most 360.
 
         The fisheye is equidistant: a ray's angle to the axis is proportional to its distance from the image centre.
-        Pixels beyond 180 degrees off the axis have no ray. Raises DataError for an impossible size or field of view.
+        Pixels more than 180 degrees from the axis have no ray. Raises DataError for an invalid size or field of view.
         """
         _check_ray_camera_size("fisheye", width, height)
         if not 0.0 < fov_degrees <= 360.0:
@@ -265,7 +266,7 @@ class RayCamera:
 
 
 AnyCamera = Camera | RayCamera
-"""Any camera that can be rendered; both kinds have ``viewmat``, ``position``, ``width`` and ``height``."""
+"""Any camera that can be rendered; all kinds have ``viewmat``, ``position``, ``width`` and ``height``."""
 
 
 def _check_ray_camera_size(name: str, width: int, height: int) -> None:

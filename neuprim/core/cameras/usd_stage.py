@@ -1,7 +1,7 @@
 """Script that prints the camera of a USD stage as JSON; runs in a separate process, without any import of neuprim.
 
-Command-line arguments: the file, the prim path of the camera ("" for the only camera), and the largest number of
-frames. An error is printed as one line on standard error.
+The command-line arguments are the file, the prim path of the camera ("" for the only camera), and the largest number of
+frames. The script prints an error as one line on standard error.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ MEMORY = 4 << 30  # limit of the process in bytes, as a file may claim any size
 def read_usd_camera(path: str, wanted: str, most: int) -> dict[str, Any]:
     """Read one camera of the USD stage ``path`` as a JSON object, for :mod:`neuprim.core.cameras.camera_files`.
 
-    Keys: ``path``, ``frames`` (one per time code), ``fps``, ``up``, ``meters`` (per unit) and ``resolution``.
-    ``wanted`` is the camera's prim path, "" for the only camera; ``most`` limits the number of frames. Raises
-    SystemExit with an error message.
+    The object has the keys ``path`` (prim path of the camera), ``frames`` (one per time code), ``fps``, ``up`` (axis),
+    ``meters`` (per unit of the stage) and ``resolution``. ``wanted`` is the camera's prim path, "" for the only camera;
+    ``most`` limits the number of frames. Raises SystemExit with an error message.
     """
     from pxr import Tf, Usd, UsdGeom
 
@@ -52,10 +52,11 @@ def read_usd_camera(path: str, wanted: str, most: int) -> dict[str, Any]:
 
 
 def usd_camera_times(stage: Any, camera: Any, most: int, Usd: Any, UsdGeom: Any) -> list[Any]:
-    """Return the time codes at which to read a camera; raise SystemExit if they are more than ``most``.
+    """Return the time codes at which to read a camera; raise SystemExit for more than ``most`` time codes.
 
-    A moving camera is read at every step of 1 from the stage's start to its end. A camera at rest is read once: at the
-    stage's start, or at the earliest time if the stage has no time range. ``Usd`` and ``UsdGeom`` are modules of pxr.
+    A moving camera is read at time codes in steps of 1, from the stage's start time code to the end time code. A camera
+    at rest is read once: at the start time code, or at USD's earliest time if the stage has no time range. ``Usd`` and
+    ``UsdGeom`` are modules of the package pxr.
     """
     prim, moves = camera.GetPrim(), any(a.ValueMightBeTimeVarying() for a in camera.GetPrim().GetAttributes())
     while not moves and prim and not prim.IsPseudoRoot():
@@ -71,7 +72,7 @@ def usd_camera_times(stage: Any, camera: Any, most: int, Usd: Any, UsdGeom: Any)
         raise SystemExit("the camera moves, but startTimeCode and endTimeCode are missing; expected both")
     first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
     if not (math.isfinite(first) and math.isfinite(last) and 0 <= last - first < most):
-        raise SystemExit(f"startTimeCode {first:g} and endTimeCode {last:g}; expected 1 to {most} time codes")
+        raise SystemExit(f"startTimeCode {first:g} to endTimeCode {last:g}; expected a range of 1 to {most} time codes")
     return [Usd.TimeCode(first + i) for i in range(int(last - first + 1e-9) + 1)]
 
 

@@ -1,4 +1,4 @@
-"""Transform between the coordinates of the user's files (world) and those of the model (scene)."""
+"""Transform between the coordinates of the user's files (world) and the coordinates of the model (scene)."""
 
 from __future__ import annotations
 
@@ -28,6 +28,10 @@ class World:
 
     The transform is a rotation, one scale and an offset. Models are in scene units, mostly float32. Coordinates that
     users give or get (cameras, lights, boxes, exported positions) are world coordinates in float64.
+
+    Attributes:
+        scene_from_world: (4, 4) float64 matrix that maps world to scene coordinates.
+        up: (3,) upward direction in scene coordinates.
     """
 
     scene_from_world: Tensor = field(default_factory=lambda: torch.eye(4, dtype=torch.float64))  # (4, 4) float64
@@ -58,7 +62,10 @@ class World:
 
     @cached_property
     def inverse(self) -> World:
-        """The inverse transform, a World whose methods ``scene_...`` convert from scene to world coordinates."""
+        """The inverse transform, a World.
+
+        The methods ``scene_...`` of the inverse convert from scene to world coordinates.
+        """
         back = torch.eye(4, dtype=torch.float64)
         back[:3, :3] = torch.linalg.inv(self.scene_from_world[:3, :3])
         back[:3, 3] = -back[:3, :3] @ self.scene_from_world[:3, 3]
@@ -111,10 +118,10 @@ class World:
 
     @staticmethod
     def of(header: Mapping[str, Any], where: str) -> World:
-        """Return the transform that a model's ``header`` stores; the identity if it stores none.
+        """Return the transform that a model's ``header`` stores; the identity if the header has no transform.
 
-        The upward direction comes from the header, too, else it is +z. Raises DataError, which names the file
-        ``where``, if the header is damaged.
+        The upward direction comes from the header, too; without an entry, it is +z. Raises DataError, which names the
+        file ``where``, if the header is damaged.
         """
         record, facts = header.get("world"), header.get("data")
         world = World()
@@ -133,7 +140,10 @@ class World:
             raise DataError(f"{where} is damaged ({type(error).__name__})") from None
 
     def validate(self, where: str) -> World:
-        """Return this transform; raise DataError naming ``where`` unless it is a rotation, one scale and an offset."""
+        """Return this transform; raise DataError unless the matrix is a rotation, one scale and an offset.
+
+        ``where`` names the matrix in the error.
+        """
         matrix = self.scene_from_world
         fits = isinstance(matrix, Tensor) and matrix.shape == (4, 4) and matrix.dtype == torch.float64
         if fits and bool(matrix.isfinite().all()) and matrix[3].tolist() == [0, 0, 0, 1]:

@@ -61,7 +61,7 @@ _POSITION_STEPS = 50.0  # smallest number of position steps in the median of the
 
 
 def canonical_model(model: Primitives) -> Primitives:
-    """Return an equivalent model with canonical parameters, the form that files store; detached, on the CPU.
+    """Return an equivalent model whose parameters have the canonical form that files store; detached, on the CPU.
 
     Raises CheckpointError for values that a file cannot store, FormError if a field returns invalid parameters.
     """
@@ -92,7 +92,8 @@ def canonical_model(model: Primitives) -> Primitives:
 def fit_quantizers(model: Primitives, table: BitTable) -> Quantizers:
     """Return a quantizer for each parameter of a canonical model: ranges fit the values, bits are from ``table``.
 
-    Positions and columns with outliers get more bits than in ``table``, unless the parameter is in ``table.exact``.
+    A column is one number of every primitive. Columns with outliers, and positions with too long steps, get more bits
+    than in ``table``, unless the parameter is in ``table.exact``.
     """
     found: Quantizers = {}
     sparse = _sparse_quantized_parameters(model)
@@ -119,8 +120,8 @@ def fit_quantizers(model: Primitives, table: BitTable) -> Quantizers:
 def fit_quantizers_to_error(model: Primitives, effects: Mapping[str, Tensor], error: float) -> Quantizers:
     """Return quantizers that make every column (one stored number of all primitives) add the same image error.
 
-    Rounding to steps of length s has a mean squared error of s^2 / 12. Equal errors need the fewest bits in total
-    (reverse water filling).
+    Rounding to steps of length s has a mean squared error of s^2 / 12. If all columns add the same error, the file
+    needs the fewest bits in total (reverse water filling).
 
     Args:
         model: from :func:`canonical_model`.
@@ -161,7 +162,10 @@ def _even_position_quantizer(x: Tensor, steps: Tensor) -> ColumnQuantizer:
 
 
 def _sparse_quantized_parameters(model: Primitives) -> set[str]:
-    """Return the names of parameters in which pruning set units of some primitives to zero; zeros must stay exact."""
+    """Return the names of parameters in which pruning set units (such as neurons) of some primitives to zero.
+
+    The quantizers of these parameters must decode zeros exactly.
+    """
     pieces = prunable_units_of_model(model.density, model.colour).values()
     return {
         name for piece in pieces if not bool(primitives_with_unit(piece, model.params).all()) for name in piece.places
@@ -169,8 +173,11 @@ def _sparse_quantized_parameters(model: Primitives) -> set[str]:
 
 
 def _fit_position_quantizer(model: Primitives, x: Tensor, bits: int, exact: bool) -> ColumnQuantizer:
-    """Return a quantizer whose range contains all positions ``x`` (N, 3). Unless ``exact``, ``bits`` is raised, up to
-    20, until a step is at most 1/50 of the median longest semi-axis."""
+    """Return a quantizer whose range contains all positions ``x`` (N, 3).
+
+    Unless ``exact``, ``bits`` is raised, up to 20, until a step is at most 1/50 of the primitives' median longest
+    semi-axis.
+    """
     if model.count and not exact:
         width = (x.amax(0) - x.amin(0)).double().max()
         size = model.params["log_scales"].double().amax(1).exp().median()
@@ -211,8 +218,11 @@ def encode_sections(model: Primitives, made: Quantizers) -> list[CompressedSecti
 def _sparse_column_masks(
     model: Primitives, made: Quantizers, codes: Mapping[str, Tensor]
 ) -> tuple[list[np.ndarray], dict[str, list[int]]]:
-    """Return (N,) bool masks of the primitives in which a unit is not zero, and the mask number of each column. Masks
-    exist only for units that are zero in enough primitives. Numbers are by parameter and count from 1; 0: no mask."""
+    """Return masks of the primitives in which a prunable unit is not zero, and the mask number of each column.
+
+    Masks are (N,) bool. Only units that are zero in at least 2 % of the primitives have a mask. The mask numbers are
+    lists by parameter name; they count from 1, and 0 means no mask.
+    """
     shapes = {spec.name: spec.shape for spec in model.specs}
     zero = {
         n: (s.values(codes[n]) == 0).reshape(model.count, *shapes[n])
@@ -237,7 +247,10 @@ def _sparse_column_masks(
 
 
 def fake_quantize(params: Mapping[str, Tensor], made: Quantizers) -> dict[str, Tensor]:
-    """Quantize and dequantize parameters, with straight-through gradients; values beyond a range are clamped."""
+    """Quantize and dequantize parameters, with straight-through gradients.
+
+    Values outside the range of their quantizer are clamped.
+    """
     return {
         name: made[name].fake_quantize(x.reshape(len(x), math.prod(x.shape[1:]))).reshape(x.shape)
         for name, x in params.items()

@@ -1,8 +1,8 @@
 """Read and write ``.neuprim`` files: a JSON header, a table of sections, and the sections, compressed by zstd.
 
 A section holds one parameter, the bit masks or the configuration. docs/data_formats.md describes every byte; numbers
-are little-endian. Files may be hostile: every size is checked against the file size before memory is allocated, and
-:data:`MAX_EXPANSION` limits decompression.
+are little-endian. Files may come from an attacker. So every size is checked against the file size before memory is
+allocated, and :data:`MAX_EXPANSION` limits decompression.
 """
 
 from __future__ import annotations
@@ -58,8 +58,9 @@ _MAX_SECTIONS, _MAX_DIMENSIONS, _MAX_COLUMNS, _MAX_PRIMITIVES = 4096, 4, 2**20, 
 class _TableEntry:
     """Row of a file's table, which describes one section; sizes are in bytes.
 
-    ``section`` is still without content. ``content`` is the size of its planes when unpacked, ``packing`` 0 (plain) or
-    1 (zstd). ``stored`` is its size in the file, and ``checksum`` the CRC-32 of these bytes.
+    ``section`` has no content yet. ``content`` is the size of the section's byte planes after decompression.
+    ``packing`` is 0 (plain) or 1 (zstd). ``stored`` is the size of the section in the file, and ``checksum`` the CRC-32
+    of the stored bytes.
     """
 
     section: CompressedSection
@@ -82,9 +83,9 @@ class _FileHead:
 def write_compressed(
     path: Path, header: Mapping[str, Any], count: int, sections: Sequence[CompressedSection]
 ) -> dict[str, int]:
-    """Write a ``.neuprim`` file atomically; return section name -> bytes in the file. Names must be unique.
+    """Write a ``.neuprim`` file atomically; return section name -> number of bytes in the file.
 
-    Raises CheckpointError if the file cannot be written.
+    Section names must be unique. Raises CheckpointError if the file cannot be written.
     """
     text = json.dumps(header, allow_nan=False).encode()
     if len(text) > _MAX_HEADER:
@@ -134,7 +135,7 @@ def _decompression_allowed(numbers: int, size: int) -> bool:
 
 
 def is_compressed(path: Path) -> bool:
-    """Return whether the file starts with the :data:`MAGIC` of ``.neuprim`` files, whatever its name is."""
+    """Return whether the file starts with the :data:`MAGIC` of ``.neuprim`` files; the file's name does not matter."""
     try:
         with open(path, "rb") as file:
             return file.read(len(MAGIC)) == MAGIC
@@ -212,7 +213,7 @@ def _read_compressed_head(path: Path, file: BinaryIO) -> _FileHead:
         raise CheckpointError(f"{path}: the file has {size} bytes; expected at least {len(MAGIC) + _START.size}")
     version, sections, count, text_size, table_size, checksum = _START.unpack(start)
     if version != VERSION:
-        raise CheckpointError(f"{path}: format version is {version}; this neuprim reads {VERSION}")
+        raise CheckpointError(f"{path}: format version is {version}, but this neuprim reads {VERSION}")
     for what, value, most in (
         ("sections", sections, _MAX_SECTIONS),
         ("primitives", count, _MAX_PRIMITIVES),

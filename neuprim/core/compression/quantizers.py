@@ -1,7 +1,7 @@
 """Quantizers, which convert numbers to integer codes of a few bits and back, and tables of bits per parameter.
 
-A column (one number per primitive) has even steps between two float32 values, ``low`` and ``high``.
-With m = 2^bits - 1, in double precision,
+A column holds one number of every primitive. Its codes stand for even steps between two float32 values, ``low`` and
+``high``. With m = 2^bits - 1, in double precision,
 
     value = float32((low (m - code) + high code) / m)
 
@@ -31,14 +31,16 @@ _MANTISSA = 24  # bits of a float32
 _LARGEST = float(torch.finfo(torch.float32).max)
 
 CLIPS = (0.0, 1e-4, 1e-3, 1e-2)
-"""Candidate fractions of a column's values to clip at either end; the one with the least mean squared error is used."""
+"""Candidate fractions of a column's values to clip at either end. The fraction with the least mean squared error is
+used."""
 
 
 @dataclass(frozen=True)
 class ColumnQuantizer:
-    """Uniform quantizer of C columns (a column has one number per primitive) with ``bits`` bits per number, (C,) int64.
+    """Uniform quantizer of C columns, each of which holds one number per primitive.
 
-    Codes 0 to 2^bits - 1 stand for even steps from ``low`` to ``high``, (C,) float32.
+    ``bits`` (C,) int64 is the number of bits per number of each column. Codes 0 to 2^bits - 1 stand for even steps from
+    ``low`` to ``high``, (C,) float32.
     """
 
     bits: Tensor
@@ -72,7 +74,8 @@ class ColumnQuantizer:
 def fit_columns(x: Tensor, bits: Sequence[int], clips: Sequence[float] = CLIPS) -> ColumnQuantizer:
     """Return a quantizer whose ``low`` and ``high`` fit each column of x (N, C), finite and on the CPU.
 
-    ``clips`` are fractions of the values to try to clip at each end; each column takes the one of least error.
+    ``clips`` are candidate fractions of the values to clip at each end. Each column uses the fraction with the least
+    mean squared error.
     """
     wanted = torch.tensor(list(bits), dtype=torch.int64)
     best = ColumnQuantizer(wanted, torch.zeros(len(wanted)), torch.zeros(len(wanted)))
@@ -111,8 +114,10 @@ def columns_of_step(x: Tensor, steps: Tensor, through: Tensor | float) -> Column
 
 
 def snap_to_zero(columns: ColumnQuantizer) -> ColumnQuantizer:
-    """Return a quantizer in which 0 has a code that decodes to exactly 0. ``low`` and ``high`` move inwards by at most
-    two steps; a range without 0 is first extended to 0."""
+    """Return a quantizer like ``columns`` in which one code decodes to exactly 0.
+
+    ``low`` and ``high`` move inwards by at most two steps; a range without 0 is first extended to 0.
+    """
     low, high, last = columns.low.double().clamp(max=0.0), columns.high.double().clamp(min=0.0), columns.last.double()
     width = high - low
     place = -low / torch.where(width > 0, width, 1.0) * last  # position of zero, between two codes
@@ -138,7 +143,7 @@ def _column_quantile(ordered: np.ndarray, q: float) -> np.ndarray:
 def relative_quantizer_error(x: Tensor, columns: ColumnQuantizer) -> Tensor:
     """Return (C,) RMS quantization errors of the columns of x (N, C), each divided by a usual error.
 
-    The usual error is that of as many even steps from -1 to 1 standard deviation.
+    The usual error is the error of a quantizer with as many steps, from -1 to 1 standard deviation around the mean.
     """
     y = x.detach().double()
     error = (columns.values(columns.codes(x)).double() - y).square().mean(0).sqrt()
@@ -150,9 +155,10 @@ def relative_quantizer_error(x: Tensor, columns: ColumnQuantizer) -> Tensor:
 class RotationQuantizer:
     """Quantizer of unit quaternions by their three smallest components, ``bits`` each (:data:`MIN_BITS` to 16).
 
-    With h = 2^(bits-1) - 1, the three components are u / (h sqrt 2) with integers u from -h to h, in order. The largest
-    is sqrt(2 h^2 - u1^2 - u2^2 - u3^2) / (h sqrt 2), positive. Sums are of integers, root and quotient are rounded
-    once, so all machines get the same bits. The identity decodes exactly.
+    With h = 2^(bits-1) - 1, the three components are u / (h sqrt 2) with integers u from -h to h, in the order of the
+    quaternion. The largest component is sqrt(2 h^2 - u1^2 - u2^2 - u3^2) / (h sqrt 2), positive. All sums are sums of
+    integers, and root and quotient are each rounded once, so all machines decode the same bits. The identity decodes
+    exactly.
     """
 
     bits: int
@@ -163,10 +169,11 @@ class RotationQuantizer:
         return (1 << (self.bits - 1)) - 1
 
     def codes(self, quats: Tensor) -> Tensor:
-        """Return (N, 4) int64 codes of wxyz (N, 4): index of the largest component, codes of the others.
+        """Return (N, 4) int64 codes of quaternions wxyz (N, 4).
 
-        If rounding makes another component as large as the largest, that component is reduced, so that decoding and
-        encoding again returns the same codes.
+        A row has the index of the largest component, and the codes of the other three components. If rounding makes one
+        of these three as large as the largest component, the rounded component is reduced. So decoding and encoding
+        again returns the same codes.
         """
         q = quats.detach().double()
         q = q / q.abs().amax(1, keepdim=True)  # the square of a tiny norm would underflow
@@ -204,7 +211,10 @@ class RotationQuantizer:
         return self
 
     def _left(self, u: Tensor) -> Tensor:
-        """Return (N,) 2 h^2 times the square of the largest component, from the integers u (N, 3) of the others."""
+        """Return (N,) 2 h^2 times the square of the largest component.
+
+        ``u`` (N, 3) are the integers of the other three components.
+        """
         return 2 * self.half * self.half - u.square().sum(1)
 
     @staticmethod
@@ -222,10 +232,10 @@ class BitTable:
     """Number of bits of each quantized number, by parameter name."""
 
     # parameter -> bits. Several values are for the degrees 1, 2, ... of spherical harmonics (in the order of 3D
-    # Gaussian splatting); the last holds for all higher degrees
+    # Gaussian splatting); the last value holds for all higher degrees
     named: Mapping[str, tuple[int, ...]]
-    others: int  # bits of every other parameter
-    # parameters that get exactly these bits. Other parameters get more where their data need it
+    others: int  # bits of every parameter that is not in ``named``
+    # parameters that get exactly the bits in this table. Other parameters get more bits if their values need them
     exact: frozenset[str] = frozenset()
 
     def of(self, name: str, shape: tuple[int, ...]) -> list[int]:
@@ -252,7 +262,7 @@ LEVELS: dict[int, BitTable] = {
     5: _level_bits(11, 6, 6, 6, 5, 4, 4, 4, 5, 4, others=4),
 }
 """Compression level -> bits of each parameter, from nearly lossless (1) to very small (5). Positions, shapes and gains
-get more bits, because images depend on them."""
+get more bits, because images depend most on these parameters."""
 
 DEFAULT_LEVEL = 3
 

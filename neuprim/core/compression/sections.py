@@ -38,7 +38,7 @@ _MASK_NUMBER = struct.Struct("<H")
 
 
 class CorruptSection(Exception):
-    """A section has invalid content. The caller adds the name of the file to the message."""
+    """Error for a section with invalid content. The caller adds the name of the file to the message."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,9 @@ class CompressedSection:
     name: str
     coding: int  # one of CODINGS
     shape: tuple[int, ...]  # shape of one primitive's row
-    head: bytes = b""  # quantizer: a record per column, then mask numbers of sparse columns; or the bits of rotations
+    # the quantizer: a record (bits, low, high) per column, then the mask numbers of sparse columns; or the number of
+    # bits of rotations
+    head: bytes = b""
     planes: tuple[bytes, ...] = ()  # byte planes of the codes, or the text
 
     @property
@@ -58,7 +60,7 @@ class CompressedSection:
 
     @property
     def head_size(self) -> int:
-        """Number of bytes in ``head``; it follows from coding and shape."""
+        """Number of bytes in ``head``, which follows from ``coding`` and ``shape``."""
         record = _RECORD.size + (_MASK_NUMBER.size if self.coding == SPARSE else 0)
         return {TEXT: 0, MASKS: 0, ROTATIONS: 1}.get(self.coding, record * self.columns)
 
@@ -66,7 +68,10 @@ class CompressedSection:
 def pack_section(
     name: str, shape: tuple[int, ...], scheme: ColumnQuantizer | RotationQuantizer, codes: np.ndarray, coding: int
 ) -> CompressedSection:
-    """Return a section that holds codes (N, C) of a quantizer. Those of positions must be in :func:`storage_order`."""
+    """Return a section that holds codes (N, C) of a quantizer.
+
+    Codes of positions must be in the order of :func:`~neuprim.core.compression.codec.storage_order`.
+    """
     if isinstance(scheme, RotationQuantizer):
         planes = [
             *_byte_planes(codes[:, 0], 2),
@@ -98,7 +103,8 @@ def pack_sparse_columns(
 ) -> CompressedSection:
     """Return a section of codes (N, C) in which columns store only some of the primitives.
 
-    Column i stores those in mask number ``mask_of[i]``, counted from 1, or all primitives if the number is 0.
+    Column i stores the primitives for which mask number ``mask_of[i]``, counted from 1, is true. If the number is 0,
+    the column stores all primitives.
     """
     own = [codes[:, i] if of == 0 else codes[masks[of - 1], i] for i, of in enumerate(mask_of)]
     planes = [plane for column, b in zip(own, scheme.bits.tolist(), strict=True) for plane in _byte_planes(column, b)]
@@ -238,7 +244,10 @@ class _PlaneReader:
 
 
 def morton_encode(cells: np.ndarray, bits: int) -> np.ndarray:
-    """Return (N,) uint64 Z-curve keys (Morton 1966) of ``cells`` (N, 3): key bit 3 b + axis is bit b of that axis."""
+    """Return (N,) uint64 Z-curve keys (Morton 1966) of integer ``cells`` (N, 3).
+
+    Bit 3 b + axis of a key is bit b of the cell's coordinate on that axis.
+    """
     wide = cells.astype(np.uint64)
     keys = np.zeros(len(wide), np.uint64)
     for bit in range(bits):
@@ -259,7 +268,8 @@ def morton_decode(keys: np.ndarray, bits: int) -> np.ndarray:
 def compress_code_planes(planes: Sequence[bytes]) -> bytes:
     """Compress byte planes in several ways by zstd; return the smallest frame, or the plain bytes if none is smaller.
 
-    A zstd block has one entropy table, so similar columns compress best in one block and different ones in several.
+    A zstd block has one entropy table. So columns with similar bytes compress best in one block, and columns with
+    different bytes in several blocks.
     """
     whole = b"".join(planes)
     cuts = ([whole], _plane_runs(planes), planes)

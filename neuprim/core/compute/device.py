@@ -38,12 +38,12 @@ def cuda_unavailable() -> str | None:
 
 
 def current_device(kind: str) -> torch.device:
-    """Return the torch device of ``kind`` "cpu" or "cuda"; of several GPUs, torch's current one."""
+    """Return the torch device of ``kind``, "cpu" or "cuda"; with several GPUs, the current GPU of torch."""
     return torch.device(kind, torch.cuda.current_device()) if kind == CUDA else torch.device(kind)
 
 
 def copy_to_device(tensor: Tensor, device: torch.device) -> Tensor:
-    """Return the tensor on ``device``. Copies to a GPU are asynchronous, through pinned memory."""
+    """Return the tensor on ``device``. A copy from the CPU to a GPU is asynchronous, through pinned memory."""
     if tensor.device == device:
         return tensor
     if device.type != CUDA or not tensor.is_cpu:

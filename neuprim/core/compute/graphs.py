@@ -13,16 +13,17 @@ from neuprim.core.errors import warn_once
 class GraphRecorder:
     """Records functions that work on a GPU as CUDA graphs; on other devices, the functions are just called.
 
-    A function's tensors must stay at the same addresses, which its graph uses again. The first function runs once
-    without being recorded, which loads its kernels. If one of its operations waits for the device, which a graph cannot
-    do, it stops there and ``failed`` becomes true. The caller must then stop using the recorder.
+    A function's tensors must stay at the same addresses, because the replayed graph uses these addresses. The first
+    call of a recorder runs its function without recording, which loads kernels. If an operation of this function waits
+    for the GPU, which a graph cannot do, the function stops there and ``failed`` becomes true. The caller must then
+    stop using the recorder.
 
     Args:
         where: device of the functions.
-        what: what the functions do, for the warning that they wait for the device.
+        what: text that says what the functions do, for the warning that a function waits for the GPU.
 
     Attributes:
-        failed: whether an operation waited for the device; the function that contains it stopped there.
+        failed: whether an operation waited for the GPU; the function that contains this operation stopped there.
     """
 
     def __init__(self, where: torch.device, what: str) -> None:
@@ -33,7 +34,10 @@ class GraphRecorder:
         self._pool = torch.cuda.graph_pool_handle() if self._on_gpu else None
 
     def record(self, function: Callable[[], None]) -> Callable[[], None]:
-        """Return a function with the effect of ``function``; a call records a graph, which later calls replay."""
+        """Return a function with the effect of ``function``.
+
+        One call of the returned function records a graph, which later calls replay.
+        """
         if not self._on_gpu:
             return function
         replay: list[Callable[[], None]] = []

@@ -1,11 +1,11 @@
 """Compile the CPU kernels with numba: compiler flags, and the cache folder of the compiled code.
 
-numba's cache notices edits of a kernel's own file. It misses edits of other files whose functions or constants were
-compiled into the kernel. Besides, site-packages may be read-only. So compiled code is stored in the user's cache
-folder, under a hash of every source that can be part of it (:func:`kernel_sources`). ``NUMBA_CACHE_DIR``, if set,
-replaces that folder. Anyone who can write into or replace the folder controls what this user's processes execute. So
-neuprim uses the folder only if this user owns it and nobody else can change it. Otherwise compiled code goes into a
-temporary folder of this process.
+numba's cache notices edits of a kernel's own file. The cache misses edits of other files whose functions or constants
+were compiled into the kernel. Besides, the folder of installed packages may be read-only. So compiled code is stored in
+the user's cache folder, under a hash of every source file that can be part of the kernel (:func:`kernel_sources`).
+``NUMBA_CACHE_DIR``, if set, replaces the user's cache folder. Anyone who can change the folder controls what this
+user's processes execute. So neuprim uses the folder only if this user owns it and no other user can change it.
+Otherwise compiled code goes into a temporary folder of this process.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def _prefer_wide_vectors() -> None:
 
 
 def _forbid_llvm_interleaving() -> None:
-    """Ask LLVM not to interleave several vectors in a loop: loops with sums would spill registers."""
+    """Ask LLVM not to interleave several vectors in a loop, because loops with sums would need too many registers."""
     llvm.set_option("neuprim", "-force-vector-interleave=1")
 
 
@@ -52,8 +52,8 @@ _prefer_wide_vectors()
 _forbid_llvm_interleaving()
 
 FAST = {"nnan", "nsz", "arcp", "contract", "afn", "reassoc"}
-"""LLVM fast-math flags of the pixel kernels. They remove NaN checks, so ``prepare`` checks the numbers of all
-primitives before."""
+"""LLVM fast-math flags of the pixel kernels. These flags let LLVM assume that no number is NaN. So the
+preparation of a frame checks the numbers of all primitives before a pixel kernel runs."""
 
 
 _ROOT = Path(__file__).parents[2]
@@ -61,7 +61,10 @@ _IMPORT = re.compile(r"^\s*from (neuprim[\w.]*) import (\([^)]*\)|[^\n]*)|^\s*im
 
 
 def kernel_sources(module: Path, package: Path = _ROOT) -> set[Path]:
-    """Return the source files of a module's kernels: the module and, recursively, what it imports of the package."""
+    """Return the source files of a module's kernels: the module and all modules of the package that it imports.
+
+    Imports are followed recursively, except those of this module.
+    """
     found: set[Path] = set()
     todo = [module]
     while todo:
@@ -135,10 +138,12 @@ def _jit(**options: Any) -> Callable[[Any], Any]:
 
 
 inline = njit(fastmath=FAST, error_model="numpy", forceinline=True)
-"""Decorator of functions that pixel kernels call; ``forceinline`` gives the same bits with a cold and a warm cache."""
+"""Decorator of functions that pixel kernels call. ``forceinline`` makes results bit-identical whether the kernel comes
+from the cache or was just compiled."""
 
 inline_source = njit(fastmath=FAST, error_model="numpy", inline="always")
-"""Decorator that inlines a function into its caller before LLVM, so the bits are those of one single function."""
+"""Decorator that inlines a function into its caller before LLVM compiles the caller. So results have the same bits as
+if both were one function."""
 
 kernel = _jit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)  # decorator of pixel kernels
 
@@ -163,7 +168,8 @@ strict = njit(error_model="numpy", forceinline=True)  # for functions that an ex
 
 
 _COMPRESSES = 19 <= binding.llvm_version_info[0] <= 22
-"""Whether to use LLVM's vector compress intrinsic. It is experimental, so only these versions of LLVM use it."""
+"""Whether to use LLVM's vector compress intrinsic. The intrinsic is experimental, so only these versions of LLVM use
+it."""
 
 _SIXTEEN = ir.VectorType(ir.FloatType(), 16)
 
@@ -224,10 +230,11 @@ def _llvm_copy16(context, target, at, source, first):  # type: ignore[no-untyped
 
 
 def _llvm_compress16(context, array, at, first, flags):  # type: ignore[no-untyped-def]
-    """Define ``compress16``: move those of array[first : first + 16] with a flag != 0 to array[at:].
+    """Define ``compress16``: move the elements of array[first : first + 16] whose flag is not 0 to array[at:].
 
-    It returns their number, and fills up with zeros to 16 elements. Flag k of 16 is array[flags + k]. All sixteen
-    elements are read before any is written. If later elements are still needed, ``at`` must be <= ``first``.
+    ``compress16`` returns the number of moved elements, and writes zeros after them, up to 16 elements in total. The
+    flag of element k is array[flags + k]. All 16 elements are read before any is written. If later elements of the
+    array are still needed, ``at`` must be <= ``first``.
     """
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
@@ -276,7 +283,10 @@ compress16: Any = intrinsic(_llvm_compress16)
 
 
 def code_cache(folder: Path) -> Path:
-    """Return ``folder``, created if missing; if others can change it, warn and return a private temporary folder."""
+    """Return ``folder``, created if missing.
+
+    If other users can change the folder, or if it cannot be used, warn and return a private temporary folder.
+    """
     folder = folder.absolute()
     try:
         made = not folder.exists()
@@ -296,7 +306,10 @@ def code_cache(folder: Path) -> Path:
 
 
 def folder_weakness(folder: Path) -> str:
-    """Return a text that says which other users can change a folder; "" if none can, and always on Windows."""
+    """Return a text that says which other users can change a folder; "" if no other user can.
+
+    On Windows, the result is always "".
+    """
     if not hasattr(os, "getuid"):
         return ""
     own = os.getuid()
@@ -316,7 +329,7 @@ def folder_weakness(folder: Path) -> str:
 
 
 def _is_own_cache_group(number: int, user: int) -> bool:
-    """Return whether a group is the user's own: the primary one, with the user's name and no other members."""
+    """Return whether a group is the user's own: the user's primary group, with the same name and no other members."""
     import grp
     import pwd
 

@@ -1,6 +1,7 @@
-"""Run kernels that release the GIL in parallel over a range, and autograd operations without autograd where possible.
+"""Run CPU kernels in parallel over a range of items, and run autograd operations without autograd where possible.
 
-Each chunk of a range writes its own output, so results do not depend on the number of threads.
+The kernels must release the GIL. Each chunk of the range writes its own output, so results do not depend on the number
+of threads.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def limit_process_threads(threads: int) -> Iterator[None]:
 
 @contextmanager
 def limit_threads(threads: int) -> Iterator[None]:
-    """Let calls inside the block that ask for 0 threads ("all cores") use ``threads`` threads (0: all cores)."""
+    """Make calls inside the block that ask for 0 threads ("all cores") use ``threads`` threads (0: all cores)."""
     token = _limit.set(threads)
     try:
         yield
@@ -72,7 +73,10 @@ def limit_threads(threads: int) -> Iterator[None]:
 
 
 def resolve_threads(threads: int) -> int:
-    """Return how many threads :func:`parallel_for` uses if asked for ``threads``; 0 asks for all cores or the limit."""
+    """Return how many threads :func:`parallel_for` uses if it is asked for ``threads``.
+
+    0 asks for the number set by :func:`limit_threads`, or else for all cores.
+    """
     return threads or _limit.get() or core_count()
 
 

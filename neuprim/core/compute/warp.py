@@ -1,7 +1,7 @@
 """Configure Warp (NVIDIA's library of GPU kernels), and launch its kernels; no other module launches Warp kernels.
 
-Converting tensors to Warp arrays and packing them takes longer than the kernels of a small frame. So each kernel's
-launch is recorded once per device, and later launches overwrite its arguments.
+Converting tensors to Warp arrays and packing these arguments takes longer than the kernels of a small frame. So each
+kernel's launch is recorded once per device, and later launches only overwrite the arguments of the recorded launch.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from neuprim.core.io import files
 BLOCK = 256  # default threads per block
 
 OPTIONS = {"enable_backward": False, "fast_math": False, "max_unroll": 16}
-"""Module options of every kernel. Warp generates no backward kernels, because ours are written by hand; divisions and
-square roots are IEEE."""
+"""Module options of every kernel. Warp generates no backward kernels, because neuprim has its own. Divisions and square
+roots are rounded as IEEE 754 requires."""
 
 FAST = {**OPTIONS, "fast_math": True}
 """Module options of the float32 pixel kernels: approximate division, root and exponential, which a GPU computes to one
-or two units in the last place. On an H100, errors were the same with and without (``benchmarks/gpu.py --parts
-parity``), and small forms took a third less time. The CPU ignores it."""
+or two units in the last place. On an H100, errors were the same with and without ``fast_math`` (``benchmarks/gpu.py
+--parts parity``), and kernels of small density forms took a third less time. The CPU ignores ``fast_math``."""
 
 
 # ---- types of kernels' arrays, by what they hold

@@ -55,9 +55,9 @@ class View:
 class Pixels:
     """The pixels of a view."""
 
-    rgb: Tensor  # (H, W, C) float32; with alpha it is premultiplied
+    rgb: Tensor  # (H, W, C) float32 colours, premultiplied if there is alpha
     alpha: Tensor | None = None  # (H, W) float32 coverage 0..1, or None for an opaque photograph
-    mask: Tensor | None = None  # (H, W) bool: True for pixels that count; None: all count
+    mask: Tensor | None = None  # (H, W) bool: True for pixels that count; None if all pixels count
 
     def to(self, device: torch.device) -> Pixels:
         """Return a copy of the pixels on another device; the copy may be asynchronous."""
@@ -99,7 +99,7 @@ class ViewSet(ABC):
 
 
 class ViewSubset(ViewSet):
-    """The views of another view set at ``indices``, in that order. The other set caches the pixels."""
+    """The views at ``indices`` of another view set, in the order of ``indices``. The other set caches the pixels."""
 
     def __init__(self, views: ViewSet, indices: Sequence[int]) -> None:
         self._views, self._indices = views, list(indices)
@@ -129,7 +129,7 @@ class PointCloud:
     quats: Tensor | None = None  # (N, 4) rotations wxyz of the ellipsoids
     alphas: Tensor | None = None  # (N,) opacities 0..1 at the centres
     deviations: Tensor | None = None  # (N, 3) standard deviations of Gaussians, instead of axes
-    steps: Mapping[str, float] = field(default_factory=dict)  # condition -> step between neighbouring frames
+    steps: Mapping[str, float] = field(default_factory=dict)  # condition, e.g. "time" -> its step from frame to frame
 
     def rows(self, index: Tensor) -> PointCloud:
         """Return the points that ``index`` selects: (M,) int64 row numbers, or an (N,) bool mask."""
@@ -176,10 +176,10 @@ class Dataset:
     extent: float  # size of the scene in scene units (camera_extent), the unit of learning rates and size limits
     background: Tensor  # (C,) colour that evaluation composites over
     channels: int = 3  # C, channels of the images
-    color_space: Literal["srgb", "linear"] = "srgb"  # of images; "srgb" as stored in PNG
+    color_space: Literal["srgb", "linear"] = "srgb"  # colour space of the images; "srgb" as stored in PNG
     data_source: DataSource = "real"  # origin of the data, for reports
     random_background: bool = False  # whether training composites random colours (needs alpha)
-    downsampling: str = "none"  # of images, for reports: "images_4" or "200x200 from 800x800 by area"
+    downsampling: str = "none"  # how images were reduced, for reports: "images_4", "200x200 from 800x800 by area"
     up: Tensor = field(default_factory=lambda: torch.tensor([0.0, 0.0, 1.0]))  # (3,) upward direction, for orbits
     center: Tensor = field(default_factory=lambda: torch.zeros(3))  # (3,) point that the cameras look at, for orbits
     bounds: Tensor | None = None  # (2, 3) lower and upper corner of a box around everything, scene units, if known
@@ -205,7 +205,7 @@ class Dataset:
     def uniform_points(self, count: int, generator: torch.Generator) -> PointCloud:
         """Return ``count`` mid-grey points, uniform in :attr:`bounds`; raise ConfigError without bounds."""
         if self.bounds is None:
-            found = f"{self.name} has no bounds to place points in"
+            found = f"data set {self.name} has no bounding box for the points"
             raise ConfigError(f"model.init.points=box: {found}; expected model.init.points=matter")
         low, high = self.bounds.float()
         means = low + torch.rand((count, 3), generator=generator) * (high - low)
@@ -259,9 +259,10 @@ class PointSamples:
     source: Tensor | None  # (M, C) float32 extinction times isotropic source radiance; None trains the extinction only
     sigma_scale: float  # typical sigma inside matter; the loss divides errors of sigma by it
     source_scale: float = 1.0  # typical source inside matter; the loss divides errors of source by it
-    components: Mapping[str, tuple[Tensor, float]] = field(default_factory=dict)  # grid -> (M,) part of sigma, scale
+    # name of a source grid -> the (M,) part of sigma that comes from this grid, and the typical value of this part
+    components: Mapping[str, tuple[Tensor, float]] = field(default_factory=dict)
     # (M, C) float32 extinction times the radiance that is scattered per irradiance of an unoccluded light; None trains
-    # this on images only
+    # scattering on images only
     scattered: Tensor | None = None
     scattered_scale: float = 1.0  # typical ``scattered`` inside matter
 
@@ -279,14 +280,14 @@ class PointSupervision(ABC):
 def hold_out_views(dataset: Dataset, every: int) -> Dataset:
     """Return the data set with one of every ``every`` training views moved to a new test split.
 
-    One view of each group of ``every`` consecutive views is moved. Its position in the group advances by one from group
-    to group, so every time step of a multi-camera sequence keeps some training cameras. The old test split is dropped.
-    Raises ConfigError: ``every`` < 2, or fewer than two training views.
+    One view of each group of ``every`` consecutive views is moved. The position of this view in its group advances by
+    one from group to group, so that every time step of a multi-camera sequence keeps some training cameras. The old
+    test split is dropped. Raises ConfigError if ``every`` < 2, or if there are fewer than two training views.
     """
     count = len(dataset.train)
     if every < 2 or count < 2:
-        found = f"cannot hold out one in {every} of {count} training views"
-        raise ConfigError(f"{dataset.name}: {found}; expected at least 2 training views, and one in 2 or more")
+        found = f"cannot hold out 1 of every {every} views from {count} training views"
+        raise ConfigError(f"{dataset.name}: {found}; expected at least 2 views, and 1 of every 2 or more")
     test = [i for i in range(count) if i % every == i // every % every]
     train = [i for i in range(count) if i % every != i // every % every]
     return replace(dataset, train=ViewSubset(dataset.train, train), test=ViewSubset(dataset.train, test))
@@ -298,7 +299,7 @@ class DatasetImages(ABC):
     frames: Sequence[str]  # names of the frames, in order
     key: str  # hash of everything the images depend on; all processes must agree on it
     place: str  # folder or URL of the images
-    known: Mapping[str, Any]  # plain values that other processes need not compute again; passed to SceneSpec.truth
+    known: Mapping[str, Any]  # results for other processes, so that these need not compute them; see SceneSpec.truth
 
     @abstractmethod
     def missing(self) -> list[int]:
@@ -352,8 +353,8 @@ _OUTLYING_SHARE = 0.05
 def find_outliers(positions: Tensor) -> Tensor:
     """Return (N,) bool: which of the camera centres ``positions`` (N, 3) are outliers.
 
-    Distances are measured from the median of the centres. An outlier is more than 100 median distances away. If more
-    than max(1, N/20) centres are, none counts as an outlier.
+    Distances are measured from the median of the centres. A centre is an outlier if its distance is more than 100 times
+    the median distance. If this holds for more than max(1, N/20) centres, there are no outliers.
     """
     distance = (positions - positions.median(0).values).norm(dim=-1)
     far = (distance > _OUTLYING * distance.median()) & (distance.median() > 0)
@@ -363,7 +364,8 @@ def find_outliers(positions: Tensor) -> Tensor:
 def dataset_focus_point(cameras: Sequence[Camera]) -> Tensor:
     """Return the (3,) float64 point with the least mean squared distance from the cameras' optical axes.
 
-    A weak penalty pulls the point towards one :func:`camera_extent` in front of the mean camera.
+    A weak penalty pulls the point towards the position in front of the mean camera at the distance
+    :func:`camera_extent`, so that there is a solution even if all axes are parallel.
     """
     positions, forward = _dataset_optical_axes(cameras)
     eye = torch.eye(3, dtype=torch.float64)
@@ -377,9 +379,9 @@ def dataset_focus_point(cameras: Sequence[Camera]) -> Tensor:
 def dataset_axes_meet(cameras: Sequence[Camera]) -> bool:
     """Return whether the cameras look at a common point.
 
-    The axes' RMS distance from that point must be below half the cameras' RMS distance from their mean. At least 9 of
-    10 cameras must have the point in front of them. Parallel axes, rings of cameras that look outward, and cameras at
-    one position (tripods) have no common point.
+    The common point is :func:`dataset_focus_point`. The RMS distance of the optical axes from this point must be below
+    half the RMS distance of the cameras from their mean. The point must be in front of at least 9 of 10 cameras.
+    Parallel axes, rings of cameras that look outward, and cameras at one position (tripods) have no common point.
     """
     positions, forward = _dataset_optical_axes(cameras)
     offsets = dataset_focus_point(cameras) - positions
@@ -405,8 +407,8 @@ def choose_dataset_world(cameras: Sequence[Camera], where: str = "cameras") -> W
     """Choose the transform between the coordinates of a file (world) and of the scene: identity, or an offset.
 
     An extent is the :func:`camera_extent`. If the mean camera centre is farther than :data:`FAR` extents from the
-    origin, it becomes the scene's origin, rounded to multiples of a power of ten between one and ten extents. Other
-    scenes keep their coordinates exactly. ``where`` names the file in warnings.
+    origin, the mean centre becomes the scene's origin, rounded to multiples of a power of ten between one and ten
+    extents. Other scenes keep their coordinates exactly. ``where`` names the file in warnings.
     """
     views = [c.viewmat.detach().double() for c in cameras]
     # solved, not transposed: far from the origin a transpose turns the rounding of a file's rotations into metres

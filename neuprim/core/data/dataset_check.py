@@ -27,8 +27,10 @@ class DatasetError(DataError):
 
 
 def check_dataset_views(dataset: Dataset, conditions: Sequence[ConditionSpec]) -> None:
-    """Raise DatasetError unless the data set's attributes, all views, and the first view's pixels of both splits are
-    valid."""
+    """Raise DatasetError unless a data set is valid.
+
+    The function checks the attributes, all views, and the pixels of the first view of each split.
+    """
     _check_dataset_values(dataset)
     for split in ("train", "test"):
         views: ViewSet = getattr(dataset, split)
@@ -148,7 +150,8 @@ def _check_dataset_view(view: View, where: str, conditions: Sequence[ConditionSp
         outside = (value < low) | (value > high)
         if spec.strict and bool(outside.any()):
             first = float(value[outside].flatten()[0])
-            raise DatasetError(f"{what} holds {first:g}; expected {low:g} to {high:g}, its range")
+            expected = f"{low:g} to {high:g}, the range of this condition"
+            raise DatasetError(f"{what} is {first:g}; expected {expected}")
 
 
 def _check_dataset_camera(camera: AnyCamera, where: str) -> None:

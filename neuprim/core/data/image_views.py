@@ -39,7 +39,10 @@ class Distortion(ABC):
 
 @dataclass(frozen=True)
 class RadialDistortion(Distortion):
-    """OpenCV's lens model: radius r times 1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8, plus tangential terms of p1, p2."""
+    """OpenCV's lens model: the radius r becomes r (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8), plus tangential terms.
+
+    p1 and p2 are the tangential coefficients.
+    """
 
     k1: float = 0.0
     k2: float = 0.0
@@ -76,10 +79,10 @@ class FisheyeDistortion(Distortion):
 
 
 def undistortion_grid(camera: Camera, distortion: Distortion) -> tuple[Tensor, Tensor]:
-    """Return where each pixel of the undistorted ``camera`` lies in a distorted photograph of equal size, and a mask.
+    """Return the positions of the undistorted ``camera``'s pixels in a distorted photograph of equal size, and a mask.
 
-    Positions are (H, W, 2) float32 pixels (x, y), centres at +0.5. The mask is (H, W) bool: True inside the photograph,
-    on the part of the lens around the principal point where the distortion does not fold the image over.
+    Positions are (H, W, 2) float32 pixels (x, y), centres at +0.5. The mask is (H, W) bool: True for positions inside
+    the photograph, in the region around the principal point where the lens distortion does not fold the image over.
     """
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
@@ -96,7 +99,7 @@ def undistortion_grid(camera: Camera, distortion: Distortion) -> tuple[Tensor, T
 def _unfolded_pixels(camera: Camera, source: np.ndarray) -> np.ndarray:
     """Return (H, W) bool: pixels connected to the principal point without crossing a fold of the lens distortion.
 
-    ``source`` (H, W, 2) holds the pixels' positions in the photograph. At a fold their order reverses.
+    ``source`` (H, W, 2) has the pixels' positions in the photograph. At a fold, the order of these positions reverses.
     """
     # polynomial lens models turn back beyond some radius and would mirror the middle of the photograph into the corners
     if min(source.shape[:2]) < 2:
@@ -129,7 +132,7 @@ class Mask:
 
 
 def find_masks(folder: Path, files: Sequence[Path], images: Path | None = None) -> list[Mask | None]:
-    """Return a mask or None for each image file; warn how many masks there are.
+    """Return a mask, or None, for each image file; report the number of masks as a warning.
 
     The mask of ``images/a/b.jpg`` is ``masks/a/b.png``, ``masks/a/b.jpg.png`` or ``masks/a/b.jpg`` (COLMAP,
     nerfstudio). For ``images_4``, ``masks_4`` is tried first. ``dynamic_mask_b.png`` next to the image (instant-ngp) is
@@ -137,8 +140,8 @@ def find_masks(folder: Path, files: Sequence[Path], images: Path | None = None) 
 
     Args:
         folder: folder of the data set.
-        images: folder of the images; None for ``folder``, or its subfolder in an image's path that begins with
-            "images".
+        images: folder of the images. None: the subfolder of ``folder`` whose name begins with "images" in an image's
+            path, else ``folder``.
     """
     masks = [_find_mask(folder, file, images) for file in files]
     found = [m for m in masks if m is not None]
@@ -273,7 +276,7 @@ class StoredPixels(Pixels):
     """Pixels of a decoded image, mostly 8-bit, that are converted to floats on first use.
 
     After :meth:`strided`, only the chosen pixels are converted. Reading only alpha converts only alpha. A copy on a GPU
-    also stays 8-bit until its first use, in a quarter of the memory of floats.
+    also stays 8-bit until its first use, because 8 bits take a quarter of the memory of floats.
 
     Args:
         image: the decoded image; None if ``fields`` has the fields of ``Pixels``, as :func:`dataclasses.replace`
@@ -361,7 +364,7 @@ class ImageViews(ViewSet):
                 return error
             if empty or data.shape[-1] == 3 or bool(data[..., 3].any()):
                 return None
-            return DataError(f"{self.file(index)}: image is transparent everywhere; expected something to see")
+            return DataError(f"{self.file(index)}: image is fully transparent; expected at least one visible pixel")
 
         faults = {}
         with ThreadPoolExecutor(resolve_threads(0)) as pool:
@@ -393,12 +396,13 @@ class ImageViews(ViewSet):
         size = (frame.info.width, frame.info.height)
         image = read_image(frame.path, size)
         if image.shape[-1] != frame.info.channels or (image.dtype != torch.uint8) != frame.info.linear:
-            raise DataError(f"{frame.path}: file changed while it was in use; expected {frame.info.channels} channels")
+            raise DataError(f"{frame.path}: file changed since its first read; expected {frame.info.channels} channels")
         mask = None if frame.mask is None else read_mask_image(frame.mask.path, size) ^ frame.mask.inverted
         if frame.info.linear and image.shape[-1] == 4:
             alpha = image[..., 3]
             if not bool(((alpha >= -1e-3) & (alpha <= 1.001)).all()):
-                raise DataError(f"{frame.path}: alpha reaches {alpha.float().abs().max().item():.4g}; expected 0..1")
+                found = f"an alpha value has magnitude {alpha.float().abs().max().item():.4g}"
+                raise DataError(f"{frame.path}: {found}; expected 0..1")
         if frame.distortion is not None or self._factor > 1:
             image, mask = self._resample_frame(frame, image, mask)
             premultiplied = True

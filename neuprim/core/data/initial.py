@@ -25,9 +25,10 @@ _ROUNDS = 8  # times that points are drawn in the box, until enough of them are 
 def initial_points(views: ViewSet, points: PointCloud | None, count: int, generator: torch.Generator) -> PointCloud:
     """Return at most ``count`` distinct starting points of a static scene.
 
-    If ``points`` are given, the starting points are drawn from them. Otherwise they are inferred from the images: along
-    rays if the cameras do not look at one point, else on the visual hull for images with alpha, else in a box around
-    the point that the cameras look at. If the cameras have different positions, at least two see each inferred point.
+    If ``points`` are given, the starting points are drawn from ``points``. Otherwise, the starting points are inferred
+    from the images. If the cameras do not look at one point, the points lie along rays; else, for images with alpha, on
+    the visual hull; else in a box around the point that the cameras look at. If the cameras have different positions,
+    at least two cameras see each inferred point.
 
     Raises:
         ConfigError: ``count`` is not positive.
@@ -66,8 +67,8 @@ def draw_points(points: PointCloud, count: int, generator: torch.Generator) -> P
 def hull_points(views: ViewSet, count: int, generator: torch.Generator, resolution: int = 128) -> PointCloud:
     """Spread ``count`` points over the surface of the visual hull of the views' alpha masks.
 
-    The hull has ``resolution`` voxels along its longest side. Points are placed at random in its surface voxels, and
-    get the :func:`median_colors` of the pixels that show them.
+    The hull has ``resolution`` voxels along its longest side. Points are placed at random in the hull's surface voxels.
+    The colour of a point is from :func:`median_colors`.
     """
     centers, voxel = hull_surface(views, resolution)
     spread = count <= len(centers)
@@ -77,9 +78,9 @@ def hull_points(views: ViewSet, count: int, generator: torch.Generator, resoluti
 
 
 def box_starting_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
-    """Draw points in a cube around the focus point of the cameras, each in the image of at least two cameras.
+    """Draw points in a cube around the focus point of the cameras; each point is in the image of at least two cameras.
 
-    The side of the cube is the median distance of the cameras from that point.
+    The side of the cube is the median distance of the cameras from the focus point.
     """
     cameras = [views.view(i).camera for i in range(len(views))]
     center = dataset_focus_point(cameras)
@@ -98,7 +99,7 @@ def box_starting_points(views: ViewSet, count: int, generator: torch.Generator) 
 
 
 def drop_repeated_points(points: PointCloud) -> PointCloud:
-    """Return the points with distinct positions: the first point at each position."""
+    """Return the points without repeated positions; the first point at each position remains."""
     rows = _distinct_point_rows(points)
     return points if len(rows) == len(points.means) else points.rows(rows)
 
@@ -109,7 +110,10 @@ def _distinct_point_rows(points: PointCloud) -> Tensor:
 
 
 def farthest_points(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Return (count,) indices of ``points`` (M, 3) far from each other: farthest-point sampling, or a grid for many."""
+    """Return (count,) indices of ``points`` (M, 3) that are far from each other, by farthest-point sampling.
+
+    If this takes too long because there are many points, a grid selects the points instead.
+    """
     if count * len(points) > _FPS_WORK:
         return _thin_points_by_grid(points, count, generator)
     start = int(torch.randint(len(points), (1,), generator=generator))
@@ -146,7 +150,7 @@ def _thin_points_by_grid(points: Tensor, count: int, generator: torch.Generator)
 
 
 def median_colors(views: ViewSet, means: Tensor, matter: float = 0.5) -> Tensor:
-    """Return (N, C) colours of points (N, 3): the median over the views of the pixels that show them, per channel.
+    """Return (N, C) colours of the points ``means`` (N, 3): per channel, the median over the views that show a point.
 
     A view counts if the point falls on a valid pixel with alpha above ``matter``. Colours are not premultiplied. Points
     in no view get the median colour of the other points, or mid-grey.
@@ -188,9 +192,9 @@ _SHELL = 0.1  # share of the points that surround everything
 def surrounding_points(views: ViewSet, points: PointCloud, count: int, generator: torch.Generator) -> PointCloud:
     """Return at most ``count`` points for surroundings that the views show but the given ``points`` do not cover.
 
-    A pixel without a projected point nearby becomes a point of its colour, at the depth of the nearest projected
-    points, unless a point already lies there. A tenth of the points lie on a sphere around the scene, each in the image
-    of some view.
+    The given points are projected into the views. A pixel without a projected point nearby becomes a new point with the
+    pixel's colour, at the depth of the nearest projected points, unless a point already lies there. A tenth of the
+    points lie on a sphere around the scene, each in the image of some view.
     """
     if count <= 0 or not len(points.means):
         return points.rows(torch.zeros(0, dtype=torch.int64))
@@ -204,7 +208,10 @@ def surrounding_points(views: ViewSet, points: PointCloud, count: int, generator
 
 
 def _lift_starting_points(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:
-    """Turn pixels with no point of ``given`` (N, 3) nearby into at most ``count`` points, on coarse grids first."""
+    """Convert pixels without a projected point of ``given`` (N, 3) nearby to at most ``count`` new points.
+
+    The pixels are chosen on coarse grids first.
+    """
     order = torch.randperm(len(views), generator=generator)[:_VIEWS].tolist()
     known = given.double().numpy()
     means = np.zeros((0, 3))
@@ -226,7 +233,7 @@ def _find_starting_pixels(
     """Return positions (K, 3) and colours (K, C) of new points, from pixels that show no known point.
 
     Pixels of view ``index`` on a grid of spacing ``cell`` are chosen if no point of ``known`` (N, 3) projects within
-    ``cell`` pixels. Their depth is that of the nearest projected points.
+    ``cell`` pixels. The depth of a new point is from the projected points nearest to the pixel.
     """
     camera, image = views.view(index).camera, views.pixels(index)
     rotation, shift = camera.viewmat[:3, :3].double().numpy(), camera.viewmat[:3, 3].double().numpy()

@@ -32,11 +32,11 @@ _COARSE = 1e-3  # coarsest rounding of coordinates without a warning, over the s
 def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
     """Read the vertices of a PLY file as starting points, in the file's own coordinates, ``means`` in float64.
 
-    Colours (``f_dc_0..2``, or ``red green blue``) are sRGB unless a comment says that they are linear. They are
-    converted to ``color_space`` and ``channels`` channels.
-    ``scale_0..2`` with ``rot_0..3`` (wxyz) and ``opacity`` (a logit) make Gaussians; two scales make a disc, one scale
-    a ball. Vertices that are no valid points are left out with a warning. Raises DataError for a damaged or compressed
-    file, or a file without usable points.
+    Colours (``f_dc_0..2``, or ``red green blue``) are sRGB, unless a comment in the file says that colours are linear.
+    Colours are converted to ``color_space`` and ``channels`` channels.
+    Vertices with ``scale_0..2``, ``rot_0..3`` (wxyz) and ``opacity`` (a logit) are Gaussians. With only two scales, a
+    Gaussian is a disc, with one scale a ball. Vertices that are no valid points are left out with a warning. Raises
+    DataError for a damaged or compressed file, or a file without usable points.
     """
     if path.suffix.lower() in COMPRESSED:
         raise _compressed_start_points_error(path, f"{path.suffix} is a compressed format of Gaussians")
@@ -45,7 +45,7 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
         raise _compressed_start_points_error(path, "a compressed PLY (property packed_position)")
     means = _starting_point_columns(found, ("x", "y", "z"))
     if means is None:
-        raise DataError(f"{path}: the vertices have no properties x, y, z; expected points")
+        raise DataError(f"{path}: the vertices have no properties x, y, z; expected a position for each vertex")
     if not len(means):
         raise DataError(f"{path}: no vertices; expected at least one point")
     scales, opacity = _starting_point_log_sizes(found, path), _starting_point_columns(found, ("opacity",))
@@ -101,7 +101,7 @@ def _starting_point_columns(found: PlyVertices, names: tuple[str, ...]) -> np.nd
 
 
 def _starting_point_log_sizes(found: PlyVertices, path: Path) -> np.ndarray | None:
-    """Return (N, 3) logarithms of the Gaussians' sizes, -inf for a disc's missing size; None without usable sizes."""
+    """Return (N, 3) logarithms of the Gaussians' sizes, -inf for a disc's third size; None without usable sizes."""
     there = [name for name in _SCALES if name in found.names]
     if not there:
         return None

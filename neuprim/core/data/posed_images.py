@@ -65,7 +65,10 @@ _T = TypeVar("_T")
 
 
 class BadImageViews:
-    """Collector of errors of damaged views, which are left out with a warning; if ``strict``, the first is raised."""
+    """Collector of the errors of damaged views.
+
+    Damaged views are left out with a warning; if ``strict``, the first error is raised instead.
+    """
 
     def __init__(self, where: str, strict: bool) -> None:
         self._where, self._strict = where, strict
@@ -88,10 +91,10 @@ class BadImageViews:
             self._first = error
 
     def settle(self, count: int) -> None:
-        """Warn of all recorded bad views; raise DataError if they are more than half of all ``count`` views."""
+        """Warn of all recorded bad views; raise DataError if more than half of all ``count`` views are bad."""
         bad = len(self._faults)
         if 2 * bad > count:
-            more = "" if count == 1 else f"; {bad} of {count} views of {self._where} are like this"
+            more = "" if count == 1 else f"; {bad} of {count} views of {self._where} are faulty; expected at most half"
             raise DataError(f"{self._first}{more}")
         for fault in self._faults[:_LISTED]:
             warn_once(fault)
@@ -121,7 +124,10 @@ def find_image(folder: Path, text: str) -> Path | None:
 
 
 def _warn_of_images_outside_dataset(where: str, home: Path, paths: Iterable[Path]) -> None:
-    """Warn once of images outside of the data set's folder. They are read, because other tools write such paths."""
+    """Warn once of images outside of the data set's folder.
+
+    Such images are read nevertheless, because other tools write such paths.
+    """
     own = home.resolve()
     own = own if own.is_dir() else own.parent
     outside = [path for path in paths if not path.resolve().is_relative_to(own)]
@@ -131,7 +137,7 @@ def _warn_of_images_outside_dataset(where: str, home: Path, paths: Iterable[Path
 
 
 def _find_image_in_other_case(folder: Path, path: Path) -> Path | None:
-    """Return the file below ``folder`` whose path equals ``path`` but for upper and lower case; None if unclear."""
+    """Return the file below ``folder`` whose path equals ``path`` except for case; None if there is not exactly one."""
     if not path.is_relative_to(folder):
         return None
     for part in path.relative_to(folder).parts:
@@ -147,8 +153,8 @@ def exif_hint(info: ImageInfo) -> str:
     if info.orientation < 5:
         return ""
     return (
-        f"; its EXIF orientation is {info.orientation}, so that other programs show it turned, and pixels are read as "
-        "they are stored, as COLMAP reads them: give w, h of the stored pixels, or turn the pixels themselves"
+        f"; EXIF orientation {info.orientation} rotates this image in other programs, but neuprim and COLMAP read the "
+        "pixels as stored: give w, h of the stored pixels, or save the image rotated and without this EXIF entry"
     )
 
 
@@ -161,8 +167,8 @@ def missing_dataset_files_error(where: str, names: Sequence[str], hint: str = ""
 def unique_view_names(paths: Iterable[str], where: str) -> list[str]:
     """Return a view name for each image path: the path's stem (file name without suffix).
 
-    If stems repeat, the names are the whole paths with ``_`` for ``/``, and with the index in front if they repeat.
-    Raises DataError if a path occurs twice.
+    If stems repeat, the names are the whole paths without suffix, with ``_`` for ``/``. If these repeat, too, the index
+    of the image is put in front. Raises DataError if a path occurs twice.
     """
     texts = [p.replace("\\", "/").removeprefix("./") for p in paths]
     path, count = max(Counter(texts).items(), key=lambda item: item[1], default=("", 0))
@@ -181,7 +187,7 @@ def _drop_image_suffix(text: str) -> str:
 
 
 def split_every_nth(frames: Sequence[ImageFrame], n: int) -> tuple[list[ImageFrame], list[ImageFrame]]:
-    """Return (training, test) frames: every n-th, beginning with the first, is a test frame."""
+    """Return (training, test) frames: every n-th frame, beginning with the first, is a test frame."""
     return [f for i, f in enumerate(frames) if i % n], list(frames[::n])
 
 
@@ -192,12 +198,12 @@ class SceneDetails:
     up: Tensor | None = None  # (3,) upward direction; None for the mean of the cameras' upward directions
     points: PointCloud | None = None  # starting points of the format, float64 in the coordinates of the file
     prefix: str = ""  # reduction that the files already have, e.g. "images_4"
-    start: StartingPoints | None = None  # None takes points, else infers them from images at rest (initial_points)
+    start: StartingPoints | None = None  # None: initial_points, which draws from points or infers from static images
     to_linear: bool = False  # convert sRGB files to linear light
     exposure: float | Callable[[ImageViews], float] = 1.0  # divisor of linear values, or a function that finds it
     extra: object = None  # value of Dataset.extra
     positions: Sequence[str] = ()  # conditions that are positions, float64 in the coordinates of the file
-    home: Path | None = None  # folder of the data set; None: the path that ``where`` names
+    home: Path | None = None  # folder of the data set; None for the argument ``where`` of assemble_dataset
 
 
 def assemble_dataset(
@@ -273,8 +279,8 @@ def _check_dataset_splits(
             found = f"images mix OpenEXR (linear) and PNG/JPEG (sRGB), see {first.path}"
             raise DataError(f"{frame.path}: {found}; expected only OpenEXR, or only PNG and JPEG")
         if frame.info.channels != first.info.channels:
-            found = f"image has {frame.info.channels} channels, {first.path} has {first.info.channels}"
-            raise DataError(f"{frame.path}: {found}; expected all RGB or all RGBA")
+            found = f"image has {frame.info.channels} channels, but {first.path} has {first.info.channels}"
+            raise DataError(f"{frame.path}: {found}; expected only RGB images, or only RGBA images")
 
 
 def _choose_dataset_background(where: str, background: str, alpha: bool) -> str:
@@ -287,7 +293,10 @@ def _choose_dataset_background(where: str, background: str, alpha: bool) -> str:
 def _preload_split(
     where: str, images: ImageViews, split: str, strict: bool, empty: bool, progress: Callable[[str, float], None]
 ) -> None:
-    """Decode all images of a split and leave out damaged ones. Unless ``empty``, transparent images are damaged."""
+    """Decode all images of a split and leave out damaged images.
+
+    Unless ``empty``, fully transparent images count as damaged.
+    """
     bad = BadImageViews(f"{where} ({split})", strict)
     faults = images.preload(lambda fraction: progress(f"reading {split} images", fraction), empty)
     for index, error in faults.items():

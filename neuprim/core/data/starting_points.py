@@ -50,9 +50,10 @@ def hull_surface(
 ) -> tuple[Tensor, float]:
     """Return centres (M, 3) float32 of the visual hull's surface voxels, and the side of a voxel, in scene units.
 
-    ``resolution`` is in voxels along the hull's longest side. A voxel belongs to the hull under two conditions. At
-    least the fraction ``seen_views`` of the views has it in the image. At most the fraction ``wrong_views`` of the
-    views shows only alpha of at most ``matter`` there. Raises EmptyHull if the hull has no voxel.
+    ``resolution`` is the number of voxels along the hull's longest side. A voxel belongs to the hull under two
+    conditions. The voxel is in the image of at least the fraction ``seen_views`` of the views. At most the fraction
+    ``wrong_views`` of the views shows only alpha of at most ``matter`` at the voxel. Raises EmptyHull if the hull has
+    no voxel.
     """
     silhouettes = _read_silhouettes(views, matter)
     cameras = [s.camera for s in silhouettes]
@@ -92,7 +93,7 @@ def _read_silhouettes(views: ViewSet, threshold: float) -> list[_Silhouette]:
 
 
 def _refine_voxels(grid: _VoxelGrid, resolution: int) -> _VoxelGrid:
-    """Return a finer grid of the box around the remaining voxels: ``resolution`` voxels along its longest side."""
+    """Return a finer grid of the box around the remaining voxels, with ``resolution`` voxels along its longest side."""
     cells = grid.full.nonzero()
     low, high = cells.min(0).values, cells.max(0).values + 1
     voxel = grid.voxel * float((high - low).max()) / resolution
@@ -110,7 +111,8 @@ def _carve_voxels(
 ) -> _VoxelGrid:
     """Remove the voxels that do not belong to the visual hull; raise EmptyHull if none remains.
 
-    A mask is searched for matter where a cube of half side ``reach``, in voxels, around the voxel's centre projects.
+    A mask is searched for matter in the projection of a cube around the voxel's centre, with half side ``reach`` in
+    voxels.
     ``seen_views`` and ``wrong_views`` are as in :func:`hull_surface`.
     """
     cells = grid.full.nonzero()
@@ -140,10 +142,10 @@ def _carve_hull_points(
 ) -> Any:
     """Return (M,) bool: which points lie in at least ``needed`` images, at most ``allowed`` of which show no matter.
 
-    ``points`` are (M, 3). For V views, ``poses`` (V, 3, 4) are world to camera, and ``lenses`` (V, 6) hold fx, fy, cx,
-    cy, width and height. All are float64. The summed-area table (height+1, width+1) of view j begins at
-    ``tables[offsets[j]]``. The projection of a cube around each point, of half side ``reach``, is searched for matter:
-    pixels that the alpha mask marks as opaque.
+    ``points`` are (M, 3). For V views, ``poses`` (V, 3, 4) are world to camera, and ``lenses`` (V, 6) have fx, fy, cx,
+    cy, width and height. These arrays are float64. The summed-area table (height+1, width+1) of view j begins at
+    ``tables[offsets[j]]``. Matter means pixels that the alpha mask marks as opaque. An image shows matter if such
+    pixels lie in the projection of a cube around the point, with half side ``reach``.
     """
     keep = np.zeros(len(points), dtype=np.bool_)
     for i in range(len(points)):
@@ -188,7 +190,10 @@ _ROUNDS = 8
 
 
 def count_seeing_views(views: ViewSet, means: Tensor) -> Tensor:
-    """Count the views (of at most 100) in whose image each of the points (N, 3) lies, (N,) int64; ignores occlusion."""
+    """Return (N,) int64: in how many of at most 100 views each of the points (N, 3) lies in the image.
+
+    Occlusion is ignored.
+    """
     return torch.stack([views.view(i).camera.sees(means) for i in evenly_spaced(len(views), _VIEWS)]).sum(0)
 
 
@@ -197,10 +202,10 @@ def ray_starting_points(
 ) -> tuple[PointCloud, Tensor]:
     """Place at most ``count`` points on rays through random pixels, uniform in 1/z, with the colours of the pixels.
 
-    Returns the points, and the (N,) indices of the views whose pixels they come from. Depths z lie in the range where
-    other views show the same colours. If no depth fits better than infinity, all cameras are taken to be at one
-    position, and the unit of depth is arbitrary. Otherwise at least two cameras must see each point. Only pixels with
-    alpha above ``matter`` are used. Raises DataError: no two cameras see the same position, or no pixel has enough
+    Returns the points, and the (N,) index of the view of each point's pixel. Depths z lie in the range where other
+    views show the same colours. If no depth fits better than infinity, the function assumes that all cameras are at one
+    position, and the unit of depth is arbitrary. Otherwise, at least two cameras must see each point. Only pixels with
+    alpha above ``matter`` are used. Raises DataError if no two cameras see the same position, or if no pixel has enough
     alpha.
     """
     depths, mean, needed = _find_starting_depths(views, generator, matter)
@@ -236,7 +241,7 @@ def evenly_spaced(count: int, most: int) -> list[int]:
 def _draw_starting_pixels(
     views: ViewSet, count: int, generator: torch.Generator, matter: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Draw ``count`` random pixels of the views, and keep valid ones with alpha above ``matter``.
+    """Draw ``count`` random pixels of the views, and keep valid pixels with alpha above ``matter``.
 
     Returns ray origins and directions (N, 3) float64, colours (N, C) and view indices (N,). Directions have
     z = 1 in camera axes.
@@ -264,8 +269,8 @@ def _draw_starting_pixels(
 def _find_starting_depths(views: ViewSet, generator: torch.Generator, matter: float) -> tuple[Tensor, Tensor, int]:
     """Find the range of depths at which starting points may lie, from how well the views' colours agree.
 
-    Returns (D,) depths from near to far, in scene units, the (D,) mean colour difference between views at each, and
-    the number of cameras (1 or 2) that must see a point. ``matter`` is the least alpha of the pixels compared.
+    Returns (D,) depths from near to far, in scene units; the (D,) mean colour difference between views at each depth;
+    and the number of cameras (1 or 2) that must see a point. ``matter`` is the least alpha of the compared pixels.
     """
     cameras = [views.view(i).camera for i in range(len(views))]
     same = all(torch.equal(c.position, cameras[0].position) for c in cameras)
@@ -290,10 +295,10 @@ def _find_starting_depths(views: ViewSet, generator: torch.Generator, matter: fl
 
 
 def _starting_color_difference(views: ViewSet, points: Tensor, colors: Tensor, owner: Tensor) -> Tensor:
-    """Return how much the colours of other views at (N, 3) points differ from ``colors``: the (N,) median over views.
+    """Return the (N,) differences between ``colors`` and other views' pixels at (N, 3) points: the median over views.
 
-    ``owner`` (N,) is the index of the view that a point comes from, which is not compared. The result is NaN for points
-    in no other view.
+    ``owner`` (N,) is the index of the view that a point comes from; this view is not compared. The result is NaN for
+    points in no other view.
     """
     found = []
     for index in evenly_spaced(len(views), _OTHERS):

@@ -70,12 +70,12 @@ def read_image_frames(
     layout: TransformsLayout,
     skip_missing: bool = False,
 ) -> tuple[list[JsonReader], list[ImageFrame]]:
-    """Read frames; return the JSON objects and the image frames of all undamaged ones, in the order of ``records``.
+    """Read frames; return the JSON objects and image frames of all undamaged frames, in the order of ``records``.
 
-    ``document`` is the whole file; its fields apply to ``records`` (frames) that lack them. Paths are relative to
-    ``folder``. ``skip_missing`` leaves out frames whose image is missing, unless no frame would remain. Raises
-    DataError for missing images or masks, wrong, contradictory or unsupported fields, most views bad, or, with
-    ``settings.strict``, any bad view.
+    ``records`` are the JSON objects of the frames. ``document`` is the whole file; its fields apply to all frames that
+    lack these fields. Paths are relative to ``folder``. ``skip_missing`` leaves out frames whose image is missing,
+    unless no frame would remain. Raises DataError for missing images or masks, for wrong, contradictory or unsupported
+    fields, if most views are bad, or, with ``settings.strict``, if any view is bad.
     """
     for record in (document, *records):
         refuse_unsupported_camera_keys(record)
@@ -139,10 +139,10 @@ def _image_pose_numbers(value: object) -> list[float]:
 def _find_frame_masks(
     folder: Path, document: JsonReader, present: Sequence[tuple[JsonReader, Path]], layout: TransformsLayout
 ) -> list[Mask | None]:
-    """Return the mask, or None, of each frame in ``present``, pairs of a JSON object and its image file.
+    """Return the mask, or None, of each frame in ``present``: pairs of a JSON object and its image file.
 
-    Masks are named by ``mask_path`` in the frame or the file. Without this key, some layouts search for masks next to
-    the images. Raises MissingFiles if a named mask does not exist.
+    The key ``mask_path`` of the frame or of the whole file names the mask. If this key is missing everywhere, masks are
+    searched next to the images for layouts with ``masks``. Raises MissingFiles if a named mask does not exist.
     """
     if layout.masks and not any(r.has("mask_path") for r in (document, *(r for r, _ in present))):
         return find_masks(folder, [file for _, file in present])
@@ -194,11 +194,12 @@ def read_image_splits(
 def split_named_images(
     document: JsonReader, records: Sequence[JsonReader], frames: Sequence[ImageFrame], every: int
 ) -> tuple[list[ImageFrame], list[ImageFrame]]:
-    """Split frames into (training, test) by lists of names in the file; without lists, every n-th is a test view.
+    """Split frames into (training, test) by lists of names in the file; without lists, every n-th view is a test view.
 
-    Test views are those in ``test_filenames``, else those in ``val_filenames``, else all views that are not training
-    views. Training views are those in ``train_filenames``, else all views that no list names. Validation views are
-    never trained on. Raises DataError: a list names an unknown image, or training and test lists overlap.
+    Test views are named by ``test_filenames``, or by ``val_filenames`` if ``test_filenames`` is missing or empty.
+    Without these lists, all views that are not training views are test views. Training views are named by
+    ``train_filenames``. Without this list, all views in no list are training views, so that validation views are never
+    trained on. Raises DataError if a list names an unknown image, or if training and test lists overlap.
     """
     keys = [key for key in ("train_filenames", "val_filenames", "test_filenames") if document.has(key)]
     lists = {key: set(map(_plain_image_path, document.texts(key))) for key in keys}

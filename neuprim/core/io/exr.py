@@ -41,7 +41,7 @@ def check_image_file_size(path: Path, width: int, height: int) -> None:
 
 @contextmanager
 def refuse_image_file_beyond_memory(path: Path) -> Iterator[None]:
-    """Turn a MemoryError in the block into a DataError that names the image; damaged headers can claim huge sizes."""
+    """Convert a MemoryError in the block to a DataError that names the image; damaged headers can claim huge sizes."""
     try:
         yield
     except MemoryError:
@@ -72,7 +72,10 @@ def exr_channel_name_error(names: Sequence[Any]) -> str | None:
 
 
 def is_exr(path: Path, required: bool = False) -> bool:
-    """Return whether a file starts as OpenEXR. Raises DataError if it is unreadable, or ``required`` to be OpenEXR."""
+    """Return whether a file starts like an OpenEXR file.
+
+    Raises DataError if the file is unreadable or empty or, with ``required``, if it is not OpenEXR.
+    """
     try:
         with open(path, "rb") as file:
             head = file.read(8)
@@ -83,7 +86,7 @@ def is_exr(path: Path, required: bool = False) -> bool:
     if not head:
         raise DataError(f"{path}: file is empty; expected an image")
     if required and head[:4] != _MAGIC:
-        raise DataError(f"{path}: not an OpenEXR file; expected one, because other formats have no channel names")
+        raise DataError(f"{path}: not an OpenEXR file; expected OpenEXR, because other formats have no channel names")
     return head[:4] == _MAGIC
 
 
@@ -96,8 +99,8 @@ def exr_channels(path: Path) -> tuple[str, ...]:
 def read_exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[list[str], int, int]:
     """Return the names of the channels to read from an OpenEXR file, and the image's width and height in pixels.
 
-    The names are ``wanted``. None stands for R, G, B and, if present, A: without a prefix, else of the only layer that
-    has them. Raises DataError for missing or subsampled channels.
+    The names are ``wanted``. If ``wanted`` is None, the names are R, G, B and, if present, A: without a prefix, else
+    with the prefix of the only layer that has these channels. Raises DataError for missing or subsampled channels.
     """
     channels, width, height = _read_exr_header(path)
     names, expected = list(wanted or ()), ", ".join(wanted or ())
@@ -131,8 +134,8 @@ def _read_exr_header(path: Path) -> tuple[dict[str, Any], int, int]:
         found = f"OpenEXR file has {parts} parts of type {header.get('type')}"
         raise DataError(f"{path}: {found}; expected 1 part of flat scan lines or tiles")
     if (low, high) != (full_low, full_high):
-        found = f"OpenEXR data window {low}..{high} is not its display window {full_low}..{full_high}"
-        raise DataError(f"{path}: {found}; expected the same data and display window")
+        found = f"OpenEXR data window {low}..{high} differs from the display window {full_low}..{full_high}"
+        raise DataError(f"{path}: {found}; expected equal windows")
     width, height = high[0] - low[0] + 1, high[1] - low[1] + 1
     check_image_file_size(path, width, height)
     if width * height * len(channels) > _MAX_VALUES:
@@ -193,8 +196,8 @@ def write_exr_layers(
     """Write an image of several layers as one OpenEXR file.
 
     Args:
-        channels: channels by name, with the prefix of their layer; all of one size, values of half floats at most
-            65504.
+        channels: channel name, with the prefix of its layer -> channel. All channels have the same size. Values of half
+            floats are at most 65504.
         attributes: header attributes: text, numbers, float32 arrays of shape (2,), (3,) or (4, 4), lists of floats.
     """
     shapes = sorted({tuple(channel.values.shape) for channel in channels.values()})

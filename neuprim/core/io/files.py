@@ -84,8 +84,8 @@ def write_text(path: Path, text: str) -> None:
 def read_json(path: Path, what: str, instead: str) -> Any:
     """Return the content of a JSON file that neuprim wrote; None if the file does not exist.
 
-    Raises DataError if the content is not JSON, or is null. The message says what the file should be (``what``) and
-    what the user can do (``instead``).
+    Raises DataError if the content is not JSON, or is null. ``what`` (what the file should be) and ``instead`` (what
+    the user can do) are parts of the message.
     """
     try:
         data = load_json(path.read_text(encoding="utf-8"))
@@ -109,7 +109,7 @@ def read_json_record(path: Path, what: str, instead: str, version: int, parse: C
         return None
     try:
         if data["format"] != version:
-            raise DataError(f"{path}: format {data['format']!r}; this neuprim reads {version}; {instead}")
+            raise DataError(f"{path}: format is {data['format']!r}, but this neuprim reads {version}; {instead}")
         return parse(data)
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError, ConfigError) as error:
         raise DataError(f"{path}: not {what} ({type(error).__name__}: {error}); {instead}") from error
@@ -159,7 +159,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def _is_file_writer_running(number: str | None) -> bool:
-    """Return whether another process on this machine has the process ID ``number``; on Windows, assume that one has."""
+    """Return whether another process on this machine has the process ID ``number``; on Windows, always assume so."""
     # Containers reuse numbers. A file with this process's own number is old: the lock's holder has not written yet.
     if number is None or int(number) == os.getpid():
         return False
@@ -178,10 +178,10 @@ def _is_file_writer_running(number: str | None) -> bool:
 
 
 def publish_folder(final: Path, write: Callable[[Path], None], complete: Callable[[Path], bool]) -> None:
-    """Let ``write`` fill a temporary folder, then rename it to ``final``; does nothing if ``complete(final)``.
+    """Let ``write`` fill a temporary folder, then rename this folder to ``final``; do nothing if ``complete(final)``.
 
-    An incomplete folder at ``final`` is deleted. If several processes publish the same folder, the files of the first
-    one remain, so all must write the same files.
+    An incomplete folder at ``final`` is deleted. If several processes publish the same folder, only the files of the
+    first process remain. All processes must therefore write the same files.
     """
     if complete(final):
         return
@@ -190,9 +190,9 @@ def publish_folder(final: Path, write: Callable[[Path], None], complete: Callabl
 
 
 def fill_folder(final: Path, write: Callable[[Path], None], complete: Callable[[Path], bool]) -> None:
-    """Do as :func:`publish_folder`, but always call ``write``, before ``complete(final)`` is checked.
+    """Fill and rename a folder as :func:`publish_folder` does, but call ``write`` even if ``final`` is complete.
 
-    The parent folder of ``final`` must exist.
+    ``complete(final)`` is checked only after ``write``. The parent folder of ``final`` must exist.
     """
     draft = Path(tempfile.mkdtemp(prefix=f".{final.name}-", dir=final.parent))
     try:
@@ -214,9 +214,9 @@ def refuse_existing(final: Path, overwrite: bool) -> None:
     if overwrite or not os.path.lexists(final):
         return
     if not final.is_dir():
-        raise ConfigError(f"{final}: exists; --force replaces it, --out PATH writes elsewhere")
+        raise ConfigError(f"{final}: already exists; pass --force to replace it, or --out PATH to write elsewhere")
     if any(final.iterdir()):
-        remedy = "--force replaces files of the same name, --out PATH writes elsewhere"
+        remedy = "pass --force to replace files of the same name, or --out PATH to write elsewhere"
         raise ConfigError(f"{final}: exists and is not empty; {remedy}")
 
 
@@ -242,7 +242,10 @@ class StagedOutput:
         return text.replace(str(self.out), str(self._final)).replace(str(self._folder), str(self._final.parent))
 
     def publish(self) -> None:
-        """Move all files to final paths; unless ``overwrite``, ConfigError before the first move if a path exists."""
+        """Move all files to their final paths.
+
+        Unless ``overwrite``, raise ConfigError before the first move if a final path exists.
+        """
         moves: list[tuple[Path, Path]] = []
         for entry in sorted(self._folder.iterdir()):
             target = self.final_path(entry)
@@ -264,8 +267,8 @@ class StagedOutput:
 def staged_output(final: Path, overwrite: bool) -> Iterator[StagedOutput]:
     """Yield a :class:`StagedOutput` whose temporary folder is deleted after the block.
 
-    The block must call :meth:`StagedOutput.publish`. In errors raised in the block, the paths of temporary files are
-    replaced by those of the final files.
+    The block must call :meth:`StagedOutput.publish`. In the messages of errors raised in the block, paths of temporary
+    files are replaced by the final paths.
     """
     existing = final if final.is_dir() else next(p for p in (*final.parents, Path(".")) if p.exists())
     try:

@@ -57,7 +57,7 @@ class ImageInfo:
 
     width: int
     height: int
-    channels: int  # 3 (RGB), 4 (RGBA), or the number of named channels
+    channels: int  # 3 (RGB), 4 (RGBA), or the number of OpenEXR channels that were asked for by name
     linear: bool  # True for OpenEXR: linear light, premultiplied alpha; else sRGB, straight alpha
     orientation: int = 1  # orientation of EXIF, 1 to 8; reading ignores it
 
@@ -94,7 +94,10 @@ def read_image(path: Path, size: tuple[int, int] | None = None, channels: Sequen
 
 
 def read_mask_image(path: Path, size: tuple[int, int] | None = None) -> Tensor:
-    """Read a PNG, JPEG or WebP as (H, W) bool mask: True where a colour channel is not 0. Errors as in read_image."""
+    """Read a PNG, JPEG or WebP as (H, W) bool mask: True where a colour channel is not 0.
+
+    Raises the errors of :func:`read_image`.
+    """
     with refuse_image_file_beyond_memory(path), _open_image(path) as image:
         _lossless_mode(path, image)
         _check_image_size(path, image.width, image.height, size)
@@ -132,14 +135,20 @@ def _open_image(path: Path) -> Iterator[Image.Image]:
 
 
 def _png_depth_and_kind(path: Path) -> tuple[int, int]:
-    """Return (bit depth, colour type) of a PNG, else (0, -1). Pillow does not tell: it opens 16-bit RGB as 8-bit."""
+    """Return (bit depth, colour type) of a PNG; (0, -1) for other files.
+
+    Pillow does not provide the bit depth, because it opens 16-bit RGB as 8-bit.
+    """
     with open(path, "rb") as file:
         head = file.read(26)
     return (head[24], head[25]) if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 26 else (0, -1)
 
 
 def _lossless_mode(path: Path, image: Image.Image) -> str:
-    """Return "RGB" or "RGBA", the mode that holds the image without loss; DataError if none does, or for animations."""
+    """Return "RGB" or "RGBA", the mode that stores the image without loss.
+
+    Raises DataError if there is no such mode, or for animations.
+    """
     depth, kind = _png_depth_and_kind(path)
     if depth == 16 or image.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
         what = {"L": "8-bit grey JPEG", "CMYK": "CMYK JPEG"}.get(image.mode, f"{image.format} of mode {image.mode}")
@@ -251,7 +260,7 @@ def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: i
 
 
 class FrameSpool:
-    """Collects frames in a temporary file in ``folder``, not in memory, then writes them as an animation."""
+    """Collector of frames for an animation. Frames are stored in a temporary file in ``folder``, not in memory."""
 
     def __init__(self, folder: Path) -> None:
         self._file = tempfile.TemporaryFile(dir=folder)

@@ -49,7 +49,7 @@ class JsonReader:
         """Open a JSON file of camera poses that holds one object; raises DataError for any other content."""
         try:
             if path.stat().st_size > max_bytes:
-                raise DataError(f"{path}: {path.stat().st_size} bytes; expected at most {max_bytes:.0f}")
+                raise DataError(f"{path}: the file has {path.stat().st_size} bytes; expected at most {max_bytes:.0f}")
             value = load_json(path.read_text(encoding="utf-8-sig"), infinite=True)
         except FileNotFoundError:
             raise DataError(f"{path}: file not found; expected a JSON file of camera poses") from None
@@ -81,7 +81,7 @@ class JsonReader:
         return value
 
     def number_or(self, key: str, default: float, expected: str = "a finite number", low: float = -math.inf) -> float:
-        """Like :meth:`number`; returns ``default`` if the field is missing or null."""
+        """Return the number as :meth:`number` does, or ``default`` if the field is missing or null."""
         return self.number(key, expected, low) if self.has(key) else default
 
     def count(self, key: str) -> int:
@@ -106,7 +106,7 @@ class JsonReader:
         return value
 
     def array(self, key: str, shape: tuple[int, ...], expected: str) -> Tensor:
-        """Return a field of nested lists as float64 of ``shape``, (n,) or (rows, columns); all must be finite."""
+        """Return a field of nested lists of finite numbers as float64 of ``shape``, (n,) or (rows, columns)."""
 
         def read(value: Any, shape: tuple[int, ...], place: str) -> Any:
             if not shape:
@@ -147,7 +147,7 @@ _MAX_DIGITS = 20  # digits of a whole number of 64 bits
 
 
 def finite_json_number(value: object) -> float | None:
-    """Return a parsed JSON value as a float; None if it is no finite number: text, true, a list, NaN, 1e400."""
+    """Return a parsed JSON value as a float; None for all but finite numbers: text, true, a list, NaN, 1e400."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:
@@ -257,7 +257,7 @@ def _read_npz_array(
             expected = f"{np.dtype(dtype)} of {str(shape).replace('None', 'N')}"
             raise ValueError(f"{name} is {kind} of shape {actual}; expected {expected}")
         if math.prod(actual) * kind.itemsize > entry.file_size:
-            raise ValueError(f"{name} claims shape {actual}, and has {entry.file_size} bytes")
+            raise ValueError(f"{name} claims shape {actual}, but has only {entry.file_size} bytes")
     with archive.open(entry) as file:
         result: np.ndarray = np.lib.format.read_array(file, allow_pickle=False)
     return result

@@ -31,7 +31,7 @@ class PlyVertices:
     """The vertices of a PLY file."""
 
     rows: np.ndarray  # (N,) structured: one field per scalar property, in the file's byte order
-    comments: tuple[str, ...] = ()  # without the keyword
+    comments: tuple[str, ...] = ()  # text of the comment lines, without the keyword "comment"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -182,8 +182,8 @@ def _describe_ply_rows(element: _ElementHeader) -> str:
 def _read_binary(file: BinaryIO, path: Path, element: _ElementHeader, order: str, left: int) -> _Values:
     """Read the rows of an element of a binary file; return scalar properties, (N,) structured, and lists by name.
 
-    Rows are read all at once if they have equal sizes, one by one if lists differ in length. ``order`` is the byte
-    order ("<" or ">"), ``left`` the number of bytes to the end of the file.
+    If all rows have the same size, the rows are read at once. If lists differ in length, the rows are read one by one.
+    ``order`` is the byte order ("<" or ">"), ``left`` the number of bytes to the end of the file.
     """
     count, fields = element.count, element.fields
     if not count or not fields:
@@ -216,7 +216,10 @@ def _read_binary(file: BinaryIO, path: Path, element: _ElementHeader, order: str
 
 
 def _first_ply_list_lengths(file: BinaryIO, fields: list[tuple[str, str, str]], order: str) -> list[int] | None:
-    """Read the first row; return the number of values of each property, 1 for scalars; None if one is impossible."""
+    """Read the first row; return the number of values of each property, 1 for scalars.
+
+    The result is None if the length of a list is impossible.
+    """
     sizes = []
     for _, kind, length in fields:
         size = 1
@@ -248,7 +251,8 @@ def _read_row_by_row(file: BinaryIO, path: Path, element: _ElementHeader, order:
             place += size * width
             if place > len(data) or size < 0:
                 raise DataError(
-                    f"{path}: header states {element.count} {_describe_ply_rows(element)}; the file ends in row {row}"
+                    f"{path}: header states {element.count} {_describe_ply_rows(element)}, "
+                    f"but the file ends in row {row}"
                 )
     file.seek(start + place)
     octets = np.frombuffer(data, np.uint8)
@@ -319,7 +323,7 @@ def _read_ascii_lists(file: BinaryIO, element: _ElementHeader) -> tuple[np.ndarr
                 continue
             size = int(words[place])
             if not 0 <= size < len(words) - place:
-                raise ValueError(f"a list of {words[place]:g} numbers, in a line of {len(words)}")
+                raise ValueError(f"a list claims {words[place]:g} numbers, but its line has only {len(words)}")
             sizes[name].append(size)
             values[name] += words[place + 1 : place + 1 + size]
             place += 1 + size

@@ -1,7 +1,7 @@
 """Storage that several processes and machines share: a local or mounted folder, or an object store with a URL.
 
-A subfolder counts as complete when it has the file that is written last, so that an interrupted write never looks
-complete. Two processes may write the same subfolder: both write the same files, and either may finish first.
+A subfolder counts as complete when it has the file that is written last. An interrupted write therefore never looks
+complete. Two processes may write the same subfolder, because both processes write the same files.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def open_store(address: str, copies: Path) -> Store:
     """
     protocol, is_url, path = address.partition("://")
     if "::" in address or (is_url and protocol not in PROTOCOLS):
-        what = "a chain of protocols" if "::" in address else f"protocol {cut_error_text(protocol)!r}"
+        what = "chained protocols (::)" if "::" in address else f"unsupported protocol {cut_error_text(protocol)!r}"
         expected = f"a folder, or a URL of {', '.join(PROTOCOLS)}, such as s3://BUCKET/FOLDER"
         raise ConfigError(f"{cut_error_text(address)}: {what}; expected {expected}")
     if not is_url:
@@ -62,7 +62,10 @@ def open_store(address: str, copies: Path) -> Store:
 
 
 class Store:
-    """A shared folder ``path``, or ``root`` in an fsspec ``system``, copied to ``path``. Files are never changed."""
+    """A shared folder ``path``, or the folder ``root`` of an object store, whose files are copied to ``path``.
+
+    ``system`` is the fsspec client of the object store; None for a shared folder. Stored files are never changed.
+    """
 
     def __init__(self, address: str, path: Path, system: Any = None, root: str = "") -> None:
         self.address, self.path, self._system, self._root = address, path, system, root
@@ -92,7 +95,7 @@ class Store:
                 self._system.makedirs(self._root, exist_ok=True)
 
     def complete_folders(self, last: str) -> set[str]:
-        """Return the names of the complete subfolders: those that contain the file ``last``, which is written last."""
+        """Return the names of the complete subfolders, which contain the file ``last``; this file is written last."""
         if not self.is_local:
             with self._client_errors("read"):
                 self._system.invalidate_cache()
@@ -115,7 +118,8 @@ class Store:
     def fetch_file(self, name: str, max_bytes: int) -> Path:
         """Return a local path of the file ``name``. If the store has no such file, nothing exists at the path.
 
-        Files of an object store are copied first. Raises DataError, also for more than ``max_bytes``.
+        Files of an object store are copied first. Raises DataError if the store cannot be read, or if the file has more
+        than ``max_bytes``.
         """
         file = self.path / name
         if self.is_local:
@@ -210,7 +214,7 @@ class Store:
 
     @contextmanager
     def _client_errors(self, action: str) -> Iterator[None]:
-        """Turn errors of the object store's client in the block into DataError "cannot be ``action``"."""
+        """Convert errors of the object store's client in the block to the DataError "cannot be ``action``"."""
         try:
             yield
         except NeuprimError:
@@ -221,7 +225,7 @@ class Store:
 
 def _check_file_size(file: str, size: int, max_bytes: int) -> None:
     if size > max_bytes:
-        raise DataError(f"{file}: {size:,} bytes; expected at most {max_bytes:,}")
+        raise DataError(f"{file}: the file has {size:,} bytes; expected at most {max_bytes:,}")
 
 
 def _store_error_line(error: BaseException) -> str:

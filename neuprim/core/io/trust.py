@@ -1,4 +1,4 @@
-"""Whether the user trusts runs that other people made: set by ``--trust`` or by an environment variable.
+"""Setting that says whether the user trusts other people's runs: ``--trust`` or an environment variable.
 
 :mod:`neuprim.config.stored_run` says which uses of a run need trust.
 """
@@ -20,7 +20,7 @@ def trusted() -> bool:
 
 @contextmanager
 def trusting(said: bool) -> Iterator[None]:
-    """Make :func:`trusted` return True in the block if ``said`` (``--trust``); else NEUPRIM_TRUST decides."""
+    """Make :func:`trusted` return True in the block if ``said``, the flag ``--trust``; otherwise, change nothing."""
     before = os.environ.get(ENVIRONMENT)
     if said:
         os.environ[ENVIRONMENT] = "1"

@@ -110,10 +110,11 @@ def ssim(rendered: Tensor, truth: Tensor, peak: float = 1.0) -> float:
 
 
 def ssim_3dgs(rendered: Tensor, truth: Tensor) -> float:
-    """Return the structural similarity as the tools of 3D Gaussian splatting compute it, to compare with their tables.
+    """Return the SSIM as the tools of 3D Gaussian splatting compute it, for comparison with their published tables.
 
-    Differences from :func:`ssim` with values from 0 to 1: a window is centred on every pixel, and images count as black
-    outside. The mean is mostly higher. Unlike those tools, this function does not quantise images.
+    Values are from 0 to 1. Unlike in :func:`ssim`, a window is centred on every pixel, and pixels outside of an image
+    count as black, so the mean is mostly higher. Unlike the tools of 3D Gaussian splatting, this function does not
+    quantise images.
     """
     first, second = _check_images(rendered, truth)
     border = (0, 0, *(SSIM_WINDOW // 2,) * 4)
@@ -126,7 +127,10 @@ def metric_to_json(key: str, value: float) -> dict[str, float | bool | None]:
 
 
 def mean_metrics(views: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """Return JSON-able means of metrics over ``views`` (metric name -> value) by the rules of ``TaskSpec.metrics``."""
+    """Return JSON-able means over views by the rules of :attr:`TaskSpec.metrics <neuprim.core.task.TaskSpec>`.
+
+    Each element of ``views`` maps metric names to the values of one view.
+    """
     result: dict[str, Any] = {}
     for name in sorted({key for v in views for key in v}):
         having = [v for v in views if name in v]
@@ -152,8 +156,10 @@ def metric_from_json(entries: Mapping[str, object], key: str) -> float | None:
 
 
 def format_metrics(metrics: Mapping[str, Any]) -> str:
-    """Return a line on the content of metrics.json, ``PSNR 29.99 dB, SSIM 0.977 (20 held-out views)``; the mean PSNR is
-    that of the finite values."""
+    """Return a line that sums up metrics.json, such as ``PSNR 29.99 dB, SSIM 0.977 (20 held-out views)``.
+
+    The PSNR is the mean of the finite values.
+    """
     values = [value for entry in metrics["per_view"] if (value := metric_from_json(entry, "psnr")) is not None]
     wrong = [value for value in values if math.isfinite(value)]
     exact = f", {len(values) - len(wrong)} exact" if len(wrong) < len(values) else ""

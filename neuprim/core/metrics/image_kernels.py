@@ -26,7 +26,8 @@ _PIXELS = 1 << 15  # pixels whose errors are summed at a time
 def _blur_moments_down(moments, x, y, at, pitch, count):  # type: ignore[no-untyped-def]
     """Fill ``moments`` (5, at least ``count``) with the blurred x, y, x^2, y^2 and xy of two flattened images x and y.
 
-    Only the vertical half of the Gaussian blur is done, over 11 rows from the index ``at``, ``pitch`` values per row.
+    The function does only the vertical half of the Gaussian blur, over 11 rows of ``pitch`` values. The first value is
+    at the index ``at``.
     """
     for j in range(count):
         s0, s1, s2, s3, s4 = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -66,8 +67,11 @@ def _sum_ssim_of_moments(s, count, c1, c2):  # type: ignore[no-untyped-def]
 
 @kernel
 def _sum_ssim_of_rows(start, stop, x, y, height, channels, c1, c2):  # type: ignore[no-untyped-def]
-    """Return the sum of SSIM over the 11 x 11 windows whose top row is in start:stop; x and y are flattened images
-    (height, width, channels)."""
+    """Return the sum of SSIM over the 11 x 11 windows whose top row is in start:stop.
+
+    x and y are flattened images (height, width, channels). With ``peak``, the largest possible value, c1 is (0.01
+    peak)^2 and c2 is (0.03 peak)^2.
+    """
     pitch = x.shape[0] // height
     reach = (SSIM_WINDOW - 1) * channels
     windows = pitch - reach
@@ -102,8 +106,10 @@ def mean_ssim(first: Tensor, second: Tensor, peak: float) -> float:
 
 @exact_kernel
 def _sum_squares_of_pixels(start, stop, x, y, counted, channels):  # type: ignore[no-untyped-def]
-    """Return the sum of squared differences of flattened images x and y over pixels start:stop where ``counted`` is
-    True; an empty ``counted`` selects all."""
+    """Return the sum of squared differences of flattened images x and y over the pixels start:stop.
+
+    Only pixels where ``counted`` is True count; an empty ``counted`` selects all pixels.
+    """
     total = 0.0
     for pixel in range(start, stop):
         if counted.size == 0 or counted[pixel]:
@@ -114,8 +120,10 @@ def _sum_squares_of_pixels(start, stop, x, y, counted, channels):  # type: ignor
 
 
 def sum_squared_errors(first: Tensor, second: Tensor, mask: Tensor | None) -> float:
-    """Return the sum of squared differences of (H, W, C) images, float32 or float64, where the (H, W) bool mask is
-    True; None selects all pixels."""
+    """Return the sum of squared differences of two (H, W, C) images, float32 or float64.
+
+    Only pixels where the (H, W) bool ``mask`` is True count; None selects all pixels.
+    """
     channels, count = first.shape[-1], first.shape[0] * first.shape[1]
     counted = np.empty(0, np.bool_) if mask is None else _flat_values(mask)
     images = _flat_values(first), _flat_values(second)

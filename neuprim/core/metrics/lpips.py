@@ -1,8 +1,8 @@
 """LPIPS, the learned perceptual distance of two images (Zhang et al. 2018), and the metric FLIP.
 
 Users provide the weights of LPIPS: state dictionaries that LPIPS and torchvision publish, as torch or safetensors
-files. They are either a whole ``lpips.LPIPS(net="vgg")``, or a folder with one file of linear layers and one of
-convolutions. The shapes of the tensors tell whether the network is AlexNet or VGG16.
+files. The weights are either one file with a whole ``lpips.LPIPS(net="vgg")``, or a folder with one file of linear
+layers and one file of convolutions. The indices of the convolutions tell whether the network is AlexNet or VGG16.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Checks of the tensors that fields return; one-line errors name field, tensor, found and expected value.
 
-They are needed because compiled kernels do not check bounds, and torch would broadcast wrong shapes. Valid tensors are
-float32 or float64, in any mix, dense and all on one device; strides do not matter.
+The checks are needed because compiled kernels do not check bounds, and torch would broadcast wrong shapes. Valid
+tensors are dense, float32 or float64 in any mix, and all on one device; strides do not matter.
 """
 
 from __future__ import annotations
@@ -98,8 +98,10 @@ def _check_lowered_form(who: str, form: Any, kinds: tuple[type[PrimitiveTensors]
 
 
 def check_lowered_channels(found: int, colour: ColourField) -> None:
-    """Raise :class:`FormError` unless a colour field returned as many channels as it declares. ``found`` is the number
-    in the closed form; ``colour.channels`` is declared."""
+    """Raise :class:`FormError` unless the closed form of a colour field has the declared number of channels.
+
+    ``found`` is the number of channels in the closed form; ``colour.channels`` is the declared number.
+    """
     if found != colour.channels:
         raise FormError(
             f"{model_method_label(colour, 'lower')} returned a colour of C={found}; "
@@ -117,8 +119,11 @@ def check_model_tensor_shape(name: str, value: Any, shape: tuple[int, ...], why:
 
 
 def check_active_primitive_rows(rows: Any, model: int | None, who: str, length: int | None = None) -> None:
-    """Raise :class:`FormError` unless ``rows`` are ascending int64 indices of primitives, (M,). ``model`` is the number
-    of primitives, which all indices must be below. ``length`` is the expected M. None: no check."""
+    """Raise :class:`FormError` unless ``rows`` are ascending int64 indices of primitives, (M,).
+
+    All indices must be below ``model``, the number of primitives. M must be ``length``. None as ``model`` or ``length``
+    skips this check.
+    """
     found = None
     if not _is_dense_primitive_tensor(rows) or rows.dtype != torch.int64 or rows.dim() != 1:
         found = _describe_model_tensor(rows)
@@ -164,8 +169,10 @@ def check_primitive_shading(found: Any, count: int, who: str) -> Shading:
 
 
 def check_initial_primitive_tensor(spec: ParameterSpec, context: InitContext, who: str) -> Tensor:
-    """Return the float32 start value (N, *shape) of a parameter, drawn by the function ``spec.init``. Raises FormError
-    if the function returns another type or shape."""
+    """Return the float32 start values (N, *shape) of a parameter, computed by the function ``spec.init``.
+
+    Raises FormError if the function returns another type or shape.
+    """
     value, shape = spec.init(context), (context.count, *spec.shape)
     if not isinstance(value, Tensor):
         raise FormError(f"{who}: {spec.name}: init returned type {type(value).__name__}; expected a torch tensor")
@@ -175,7 +182,10 @@ def check_initial_primitive_tensor(spec: ParameterSpec, context: InitContext, wh
 
 
 def check_primitive_tensors(found: Any, like: Mapping[str, Tensor], who: str) -> dict[str, Tensor]:
-    """Return the tensors that a field's method returned; raise FormError for names or shapes other than in ``like``."""
+    """Return ``found``, the tensors that a field's method returned, as a dict.
+
+    Raises FormError unless the names, shapes and dtypes are those in ``like``.
+    """
     if not isinstance(found, Mapping):
         raise FormError(f"{who} returned type {type(found).__name__}; expected a dict of tensors by name")
     if set(found) != set(like):
@@ -192,8 +202,10 @@ def check_primitive_tensors(found: Any, like: Mapping[str, Tensor], who: str) ->
 
 
 def non_finite_primitive_error(tensors: Mapping[str, Tensor], row: int) -> NonFiniteError:
-    """Return an error that says why primitive ``row`` cannot be rendered. The reason is a NaN or infinite value, a zero
-    quaternion, or semi-axes beyond the range of float32."""
+    """Return an error that says why primitive ``row`` cannot be rendered.
+
+    The reason is a NaN or infinite value, a zero quaternion, or semi-axes beyond the range of float32.
+    """
     for name, value in tensors.items():
         if not bool(torch.isfinite(value[row]).all()):
             return NonFiniteError(f"{name} of primitive {row} is not finite: {value[row].flatten()[:8].tolist()}")
@@ -206,8 +218,11 @@ def non_finite_primitive_error(tensors: Mapping[str, Tensor], row: int) -> NonFi
 
 
 def check_primitive_colours_finite(tensors: Mapping[str, Tensor], named: Mapping[str, Tensor] | None = None) -> None:
-    """Raise NonFiniteError if a colour is NaN or infinite; kernels that check primitives do not read colours. Waits for
-    a GPU. ``named`` are all tensors of the frame; the message names the first that is not finite."""
+    """Raise NonFiniteError if a colour in ``tensors`` is NaN or infinite; waits for a GPU.
+
+    The kernels that check primitives do not read colours, so that colours need this check. ``named`` are all tensors of
+    the frame; the message names the first tensor that is not finite.
+    """
     total = sum(tensor.detach().sum(dtype=torch.float64) for tensor in tensors.values())
     if math.isfinite(total):  # one number, so that a GPU is waited for once
         return

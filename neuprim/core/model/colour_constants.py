@@ -1,7 +1,7 @@
 """Constants of the kernels that compute view-dependent colours.
 
 C0 to C3 are factors of the real spherical harmonics of degrees 0 to 3, with the signs of 3D Gaussian splatting. The
-others are limits of spherical Gaussian lobes.
+other constants are limits of spherical Gaussian lobes (:mod:`neuprim.core.model.lobes`).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ C3 = (
 MOST_LOBES = 8
 
 LOG_LIMIT = 20.0
-"""The logarithm of a lobe's sharpness is clamped to plus or minus this value. Beyond, its gradient is zero."""
+"""The logarithm of a lobe's sharpness is clamped to plus or minus this value; beyond, it gets no gradient."""
 
 SHORTEST = 1e-24
 """Vectors of at most this length are treated as zero: they have no direction and pass no gradient. The limit keeps

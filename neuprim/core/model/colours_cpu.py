@@ -43,8 +43,10 @@ def _basis(x, y, z, degree, Y):  # type: ignore[no-untyped-def]
 
 @strict
 def _basis_gradient(x, y, z, degree, g, out):  # type: ignore[no-untyped-def]
-    """Write sum_k g[k] dY_k/d(x, y, z) into ``out`` (3,), with Y the spherical harmonics that :func:`_basis` writes. Y
-    is differentiated as polynomials in x, y and z, without the constraint that (x, y, z) has length 1."""
+    """Write sum_k g[k] dY_k/d(x, y, z) into ``out`` (3,), with Y the spherical harmonics that :func:`_basis` writes.
+
+    The Y_k are differentiated as polynomials in x, y and z, as if the vector (x, y, z) could have any length.
+    """
     gx, gy, gz = -C1 * g[2], -C1 * g[0], C1 * g[1]
     if degree >= 2:
         a, b, c, d, e = C2[0] * g[3], C2[1] * g[4], C2[2] * g[5], C2[3] * g[6], C2[4] * g[7]
@@ -172,10 +174,10 @@ def _unit_or_zero(x, y, z):  # type: ignore[no-untyped-def]
 
 @strict
 def lobe_weight(nearness, log_sharpness):  # type: ignore[no-untyped-def]
-    """Return (exp(s n), n, s): the weight of a spherical Gaussian lobe, ``nearness`` clamped to at most 0, and s.
+    """Return three numbers of a spherical Gaussian lobe: its weight exp(s n), the clamped nearness n, its sharpness s.
 
-    ``nearness`` is the cosine between the lobe's axis and a direction, minus 1. The sharpness s is
-    exp(``log_sharpness``), with the logarithm clamped to -20..20. NaN stays NaN.
+    ``nearness`` is the cosine between the lobe's axis and a direction, minus 1; n is ``nearness`` clamped to at most 0.
+    The sharpness s is exp(``log_sharpness``), with the logarithm clamped to -20..20. NaN stays NaN.
     """
     if log_sharpness > LOG_LIMIT:
         log_sharpness = LOG_LIMIT
@@ -266,6 +268,6 @@ def fused_lobe_colors(
     means: Tensor, dc: Tensor, amplitude: Tensor, axis: Tensor, log_sharpness: Tensor, origin: Tensor
 ) -> Tensor:
     """Return the (N, C) colours of :func:`~neuprim.core.model.lobes.lobe_colors`, computed by CPU kernels;
-    differentiable. All tensors but ``origin`` are float32 on the CPU. There is at least one lobe."""
+    differentiable. All tensors except ``origin`` are float32 on the CPU. Each primitive has at least one lobe."""
     result: Tensor = apply_kernel_operation(_LobeColors, means, dc, amplitude, axis, log_sharpness, origin)
     return result

@@ -21,7 +21,7 @@ _vec15 = wp.types.vector(length=15, dtype=wp.float64)
 
 @functools.cache
 def _harmonic_functions(degree: int) -> tuple[Any, Any]:
-    """Return Warp functions for harmonics up to ``degree``: their values, and their gradient by the direction."""
+    """Return two Warp functions: spherical harmonics up to ``degree``, and their gradient by the direction."""
     a0, a1, a2, a3, a4 = (d(c) for c in C2)
     b0, b1, b2, b3, b4, b5, b6 = (d(c) for c in C3)
     two, three, four, six, eight = d(2.0), d(3.0), d(4.0), d(6.0), d(8.0)
@@ -53,7 +53,7 @@ def _harmonic_functions(degree: int) -> tuple[Any, Any]:
 
     @wp.func
     def gradient(v: wp.vec3d, g: _vec15):
-        """Return sum_k g_k dY_k/dv (3 numbers), Y = basis(v), without the constraint that v has length 1."""
+        """Return the vector sum_k g_k dY_k/dv, where Y = basis(v) is differentiated as if v could have any length."""
         x, y, z = v[0], v[1], v[2]
         out = wp.vec3d(-_C1 * g[2], -_C1 * g[0], _C1 * g[1])
         if wp.static(degree >= 2):
@@ -202,7 +202,7 @@ def lobe_sharpness(log_sharpness: float):
 
 @wp.func
 def lobe_nearness(cosine: wp.float64):
-    """Return ``cosine`` - 1, at most 0: the exponent of a lobe divided by its sharpness."""
+    """Return ``cosine`` - 1, clamped to at most 0; times the sharpness, this is the exponent of a lobe."""
     if cosine > d(1.0):
         return d(0.0)
     return cosine - d(1.0)
@@ -239,7 +239,7 @@ def _lobe_backward(
     grad: wp.array2d(dtype=float), g_means: wp.array(dtype=wp.vec3), g_dc: wp.array2d(dtype=float),
     g_amplitude: wp.array3d(dtype=float), g_axis: wp.array2d(dtype=wp.vec3), g_log_sharpness: wp.array2d(dtype=float),
 ):  # fmt: skip
-    """Compute the gradients of :func:`_lobe_forward`, one thread per primitive; ``color`` is its result."""
+    """Compute the gradients of :func:`_lobe_forward`, one thread per primitive; ``color`` is the forward result."""
     i = wp.tid()
     offset = wp.vec3d(means[i]) - wp.vec3d(origin[0], origin[1], origin[2])
     near = _one_over(offset)
@@ -321,6 +321,6 @@ def fused_lobe_colors(
     means: Tensor, dc: Tensor, amplitude: Tensor, axis: Tensor, log_sharpness: Tensor, origin: Tensor
 ) -> Tensor:
     """Return the (N, C) colours of :func:`~neuprim.core.model.lobes.lobe_colors`, computed by one GPU kernel;
-    differentiable. All tensors but ``origin`` are float32 on the GPU. There is at least one lobe."""
+    differentiable. All tensors except ``origin`` are float32 on the GPU. Each primitive has at least one lobe."""
     result: Tensor = _LobeColors.apply(means, dc, amplitude, axis, log_sharpness, origin)
     return result

@@ -4,20 +4,22 @@
     + b2,   g = exp(log_gain)
 
 x~ = (x - mu)/m, with the centre mu and the longest semi-axis m; y is x in coordinates in which the ellipsoid is the
-unit ball. p = 0 without gain is the paper's primitive. p = 2 with K = 0 is close to a Gaussian that ends there.
+unit ball. p = 0 without gain is the paper's primitive. p = 2 with K = 0 is close to a Gaussian that is cut off at the
+boundary.
 
-**Canonical form.** A sum of w_k cos(rate (v_k . x + b_k)) stays the same when (v_k, b_k) changes sign, when rate b_k
-gains a whole turn, and when rate b_k gains half a turn and w_k changes sign. So every w_k can be positive, and every
-rate b_k between 0 and half a turn.
+**Canonical form.** A sum of w_k cos(rate (v_k . x + b_k)) has the same value for several sets of parameters. The
+sum does not change when (v_k, b_k) changes sign, or when a whole turn (2 pi) is added to rate b_k. Nor does the sum
+change when half a turn is added to rate b_k and w_k changes sign. So every w_k can be positive, and every rate b_k
+between 0 and half a turn.
 
-**Pruning** keeps the neurons whose term of the density varies most, and adds the mean of the other terms to b2. Over an
-ellipsoid with semi-axes s and orientation R, x~ = R diag(s/m) y with y in the unit ball, a neuron's cosine has
+**Pruning** keeps the neurons whose term of the density varies most, and adds the means of the removed terms to b2. Over
+an ellipsoid with semi-axes s and orientation R, x~ = R diag(s/m) y with y in the unit ball, a neuron's cosine has
 
     mean of cos(phi + r.y) = cos(phi) b(|r|),   b(r) = 3 (sin r - r cos r)/r^3,   phi = omega0 b1,
     r = omega0 diag(s/m) R^T W1
 
-and its variance follows from the mean of cos^2 = (1 + cos 2(.))/2. Where phases advance in time, phi + xi a for xi in
-0..1, b gets the factor sinc(a/2) and phi becomes phi + a/2. All means assume a hard edge.
+The variance of the cosine follows from the mean of cos^2 = (1 + cos 2(.))/2. If the phase changes with the time xi in
+0..1, as phi + xi a, then b gets the factor sinc(a/2) and phi becomes phi + a/2. All means assume a hard edge.
 """
 
 from __future__ import annotations
@@ -42,8 +44,8 @@ __all__ = ["CosineDensity", "cosine_density", "split_cosine"]
 OMEGA0 = 30.0  # SIREN boost: multiplies the whole phase
 
 GAIN_LIMIT = 20.0
-"""log_gain is clamped to plus or minus this value, without gradient beyond. No scene needs densities so far apart, and
-products with the other weights stay far from the limits of float32."""
+"""log_gain is clamped to plus or minus this value; beyond the limit, log_gain gets no gradient. No scene needs a wider
+range of densities, and products with the other weights stay far from the limits of float32."""
 
 
 DENSITY_OPTIONS: dict[str, Any] = {"edge": EDGES, "gain": bool, "omega0": Annotated[float, Range(above=0)]}
@@ -59,14 +61,15 @@ class CosineDensity(DensityField):
     """Density field of the neural primitive: K cosine neurons and an offset (docs/mathematics.md, "One primitive").
 
     The field lowers to :class:`~neuprim.core.model.fields.Cosine`. Each primitive has 5K + 1 parameters, plus one with
-    ``gain``. ``init.mode`` "opaque" (default) starts every primitive at central opacity ``init.alpha``. "paper" draws
-    the offset as the paper does; half of all chords then have no gradient. Raises ValueError for invalid arguments.
+    ``gain``. With ``init.mode`` "opaque" (default), a primitive starts with the opacity of its starting point if it is
+    known, else with central opacity ``init.alpha``. "paper" draws the offset as the paper does; half of all chords then
+    have no gradient. Raises ValueError for invalid arguments.
 
     Args:
         neurons: number K of cosines, 0 to 16.
         omega0: factor on the phases, above 0.
-        edge: exponent p of the factor (1 - |y|^2)^p: 0 for a hard edge, 1 or 2 for a soft one.
-        gain: whether a parameter log_gain multiplies the density by its exponential.
+        edge: exponent p of the factor (1 - |y|^2)^p: 0 for a hard edge, 1 or 2 for a soft edge.
+        gain: whether primitives have a parameter log_gain, whose exponential multiplies the density.
     """
 
     init_settings = ("mode", "alpha")
@@ -155,7 +158,7 @@ class CosineDensity(DensityField):
 def apply_density_gain(w2: Tensor, b2: Tensor, log_gain: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return amplitudes ``w2`` (N, K) and offsets ``b2`` (N, 1) multiplied by exp(``log_gain``), (N, 1) or (N,).
 
-    ``log_gain`` is clamped to plus or minus :data:`GAIN_LIMIT`. With None, both are returned unchanged.
+    ``log_gain`` is clamped to plus or minus :data:`GAIN_LIMIT`. With None, ``w2`` and ``b2`` are returned unchanged.
     """
     if log_gain is None:
         return w2, b2
@@ -169,7 +172,11 @@ _FAINT, _SOLID = 0.02, 0.98
 
 
 def _initial_density_offset(ctx: InitContext, amplitude: float, norm: float) -> Tensor:
-    """Return (N, 1) initial offsets b2 for ``init.mode`` and ``init.alpha``; ``norm`` is the N_p of the edge."""
+    """Return the (N, 1) initial offsets b2, as the settings ``init.mode`` and ``init.alpha`` choose them.
+
+    ``norm`` is N_p, the integral of the edge's weight (:data:`~neuprim.core.model.edge.NORMS`). ``amplitude`` is the
+    largest initial offset in the mode "paper".
+    """
     mode, alpha = ctx.choice("mode", "opaque", "paper"), ctx.number("alpha", 0.8, 0, 1)
     opaque = -math.log1p(-alpha) / norm  # a central chord of a sphere has optical depth N_p b2
     if mode == "paper" and amplitude:
@@ -198,7 +205,7 @@ def cosine_density(form: Cosine, geometry: Geometry, prim: Tensor, x: Tensor) ->
 
 
 def split_density_scale(old: Geometry, new: Geometry, edge: int = 0) -> Tensor:
-    """Return the float64 factors c by which :func:`split_cosine` multiplies w2 and b2, one per child.
+    """Return the float64 factors c, one per child, by which :func:`split_cosine` multiplies w2 and b2.
 
     ``old`` and ``new`` are the ellipsoids of parents and children, one row per child.
     """
@@ -211,12 +218,13 @@ def split_density_scale(old: Geometry, new: Geometry, edge: int = 0) -> Tensor:
 def split_cosine(
     params: Params, old: Geometry, new: Geometry, omega0: float = OMEGA0, edge: int = 0
 ) -> dict[str, Tensor]:
-    """Return the parameters of children of split primitives, which continue the function f of their parents.
+    """Return the parameters of the children of split primitives. A child continues the function f of its parent.
 
     W1' = r W1, b1' = b1 + W1 (mu'-mu)/m and (w2, b2)' = c (w2, b2), with r = m'/m. Primes mark the child, mu is the
     centre, m the longest semi-axis. With a hard edge, c = r, and sigma does not change inside a child. With a soft
-    edge, sigma also fades inside a child. Then c = r V/(2 V'), V the product of the semi-axes. Thus both children
-    together have the integral of (1 - |y|^2)^p/m of their parent. Float64 keeps the change of f to the final rounding.
+    edge, the child's own edge makes sigma fade inside the child. Then c = r V/(2 V'), with V the product of the
+    semi-axes: the two children together have their parent's integral of (1 - |y|^2)^p/m. All steps are in float64, so
+    that f changes only by the final rounding.
     """
     r, c = split_density_scale(old, new), split_density_scale(old, new, edge)
     shift = (new.means.double() - old.means.double()) / old.length_scale.double()[:, None]
@@ -244,8 +252,8 @@ def gaussian_support(edge: int, alphas: Tensor, volume: bool = False) -> tuple[T
     """Return size c (N,) and central optical depth tau (N,) of primitives that replace Gaussians; float64.
 
     c is the distance from centre to edge in standard deviations; ``alphas`` are the (N,) opacities of the Gaussians,
-    0..1. With ``volume``, the Gaussians are densities in space: their optical depth, not their alpha, is a Gaussian in
-    the image.
+    0..1. By default, the opacity of a Gaussian falls off as a Gaussian in the image. With ``volume``, the Gaussians are
+    densities in space, so their optical depth falls off as a Gaussian instead.
     """
     table = _gaussian_support_table(edge, volume)
     alphas = alphas.double().clamp(1e-9, 1 - 1e-9)
@@ -269,9 +277,9 @@ def _gaussian_support_table(edge: int, volume: bool) -> Tensor:
     target = -torch.expm1(torch.log1p(-opacity) * bell) if volume else opacity * bell
 
     def best(c: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (O,) squared errors of primitives of the sizes ``c`` (O,) in the image, and (O,) log tau.
+        """Return the (O,) squared image errors of primitives of the sizes ``c`` (O,), and their (O,) log tau.
 
-        The central optical depth tau is such that primitive and Gaussian have equal integrals over the image.
+        The central optical depth tau is chosen so that primitive and Gaussian have equal integrals over the image.
         """
         shape = (1 - (r / c[:, None]).square()).clamp_min(0) ** (edge + 0.5)
         low, high = torch.full_like(c, -12.0), torch.full_like(c, 6.0)
@@ -297,9 +305,9 @@ _SLACK = 1e-6  # in turns: phases this close to an end by rounding stay, so that
 def canonicalize_cosines(
     params: Params, inputs: tuple[str, ...], phase: str, weights: str, rate: float
 ) -> dict[str, Tensor]:
-    """Return parameters of the same sum of w_k cos(rate (v_k . x + b_k)), with w_k >= 0 and b_k from 0 to pi/rate.
+    """Return equivalent parameters of sums of w_k cos(rate (v_k . x + b_k)), with w_k >= 0 and b_k from 0 to pi/rate.
 
-    With several outputs, w_k >= 0 holds for the first one.
+    In a network with several outputs, w_k >= 0 holds for the first output only.
 
     Args:
         inputs: names of the frequency parameters, which multiply the inputs of the cosines, (N, K) or (N, K, ...).
@@ -326,7 +334,7 @@ def canonicalize_cosines(
 def canonicalize_gain(params: Params, strength: str, log_gain: str, limit: float) -> dict[str, Tensor]:
     """Move the magnitude of b in the products b exp(g) into g, so that b is -1, 0 or 1.
 
-    ``strength`` and ``log_gain`` name the parameters b and g. Where |g| would exceed ``limit``, both stay unchanged.
+    ``strength`` and ``log_gain`` name the parameters b and g. Where |g| would exceed ``limit``, b and g stay unchanged.
     """
     b, g = params[strength].detach(), params[log_gain].detach()
     joined = g.double().clamp(-limit, limit) + b.double().abs().log()
@@ -340,9 +348,10 @@ def smaller_cosine_neuron_counts(neurons: int) -> tuple[int, ...]:
 
 
 def prune_cosine_neurons(params: Params, geometry: Geometry, keep: int, omega0: float) -> dict[str, Tensor]:
-    """Return the parameters with the ``keep`` neurons of each primitive whose terms of the density vary most in it.
+    """Return the parameters with fewer neurons: each primitive keeps the ``keep`` neurons whose terms vary most.
 
-    The means of the removed terms are added to the offset b2.
+    A neuron's term is its part of the density inside the primitive. The means of the removed terms are added to the
+    offset b2.
     """
     W1, phase, w2 = params["W1"].double(), omega0 * params["b1"].double(), params["w2"].double()
     semi_axes = (geometry.log_scales.double() - geometry.log_length_scale.double()[:, None]).exp()

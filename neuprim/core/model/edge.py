@@ -1,16 +1,17 @@
-"""The edge of a primitive: how density fades at the ellipsoid's boundary, or extinction at the ends of a time span.
+"""Edges: how a primitive's density fades at the ellipsoid's boundary, or at both ends of the primitive's time span.
 
 The density is multiplied by (1 - u^2)^p, where u is the distance from the middle divided by the distance from the
-middle to the edge. p = 0 is a hard edge, 1 and 2 are soft. y is the position in coordinates in which the ellipsoid is
-the unit ball. A ray crosses the ellipsoid on a chord, u in [-1, 1]. If no plane cuts the chord, the weight
-(1 - |y|^2)^p on it is D^p (1 - u^2)^p, with D = 1 - |y|^2 at its middle. A cosine with this weight has the integral
+middle to the edge. The exponent p = 0 gives a hard edge, 1 and 2 give soft edges. Let y be the position in coordinates
+in which the ellipsoid is the unit ball; then the weight is (1 - |y|^2)^p. A ray crosses the ellipsoid on a chord, along
+which u runs from -1 to 1. If no plane (such as the near plane) cuts the chord, the weight is D^p (1 - u^2)^p, with
+D = 1 - |y|^2 at the chord's middle. A cosine with the weight (1 - u^2)^p has the integral
 
     1/2 integral of (1 - u^2)^p cos(phase + z u) du = N_p/2 cos(phase) B_p(z),   N = 2, 4/3, 16/15
     B_0 = sin z / z,   B_1 = 3 (B_0 - cos z)/z^2,   B_2 = 15 (B_1 - B_0)/z^2        (all 1 at z = 0)
 
-which are spherical Bessel functions, B_p = (2p + 1)!! j_p(z)/z^p. On a chord that a plane cuts, 1 - |y|^2 is a general
-quadratic c0 + c1 u + c2 u^2. Its p-th power expands in Legendre polynomials, sum a_n P_n, and each term has a closed
-form: 1/2 integral of P_n exp(i z u) du = i^n j_n(z).
+The B_p are scaled spherical Bessel functions, B_p = (2p + 1)!! j_p(z)/z^p. On a chord that a plane cuts, 1 - |y|^2 is a
+general quadratic c0 + c1 u + c2 u^2. The p-th power of this quadratic is a sum of Legendre polynomials, sum a_n P_n.
+Each term has a closed form: 1/2 integral of P_n exp(i z u) du = i^n j_n(z).
 """
 
 from __future__ import annotations
@@ -72,9 +73,9 @@ def spherical_bessel(z: Tensor, last: int) -> list[Tensor]:
 
 
 def edge_legendre(c0: Tensor, c1: Tensor, c2: Tensor, edge: int) -> list[Tensor]:
-    """Return the Legendre coefficients a_0 to a_2p of a soft edge's weight along a chord, p = ``edge``, 1 or 2.
+    """Return the Legendre coefficients a_0 to a_2p of a soft edge's weight along a chord, where p = ``edge`` is 1 or 2.
 
-    The weight is (c0 + c1 u + c2 u^2)^p = sum of a_n P_n(u), u in [-1, 1], P_n the Legendre polynomials.
+    The weight is (c0 + c1 u + c2 u^2)^p = sum of a_n P_n(u), with u in [-1, 1] and the Legendre polynomials P_n.
     """
     if edge == 1:
         return [c0 + c2 / 3, c1, 2 * c2 / 3]
@@ -104,9 +105,9 @@ def soft_edge_chord_integral(
 
 
 def edge_profile(z: Tensor, order: int) -> Tensor:
-    """Return B_p(z) = (2p + 1)!! j_p(z)/z^p for p = ``order``: the Fourier transform of (1 - u^2)^p, with B_p(0) = 1.
+    """Return B_p(z) = (2p + 1)!! j_p(z)/z^p for p = ``order``, where j_p is a spherical Bessel function.
 
-    u is in [-1, 1], and j_p is a spherical Bessel function. Float64, differentiable.
+    B_p is the Fourier transform of (1 - u^2)^p, u in [-1, 1], scaled so that B_p(0) = 1. Float64, differentiable.
     """
     if order == 0:
         return sinc(z)

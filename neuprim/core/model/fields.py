@@ -1,7 +1,7 @@
-"""Density fields and colour fields: they define the parameters of primitives, and *lower* them to a closed form.
+"""Density and colour fields: a field defines parameters of the primitives, and *lowers* them to a closed form.
 
 To lower means to apply the conditions of a frame, such as time or light, and to return one of a few closed forms
-(:mod:`neuprim.core.model.forms`). The renderer knows only these forms, so it does not depend on tasks.
+(:mod:`neuprim.core.model.forms`). The renderer knows only these forms, so the renderer does not depend on tasks.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ __all__ += ["Constant", "Cosine", "CustomColour", "CustomDensity", "LoweredColou
 __all__ += ["Shade", "Shading"]
 
 Conditions = Mapping[str, Tensor]
-"""Name of a condition -> its value in one frame, e.g. ``{"time": tensor(0.5)}``."""
+"""Map from the name of a condition to the condition's value in one frame, e.g. ``{"time": tensor(0.5)}``."""
 
 
 @dataclass(frozen=True)
@@ -53,17 +53,17 @@ class ConditionSpec:
 
     Attributes:
         name: name of the flag, and the key in a frame's conditions.
-        range: lowest and highest value of every element. Values outside the range give a warning; values that are not
-            finite are refused.
-        parse: text of ``--NAME TEXT`` -> one tensor of ``shape`` per frame; raises
+        range: lowest and highest value of every element. Values outside the range give a warning, or an error if
+            ``strict``; values that are not finite give an error.
+        parse: function that converts the text of ``--NAME TEXT`` to one tensor of ``shape`` per frame; raises
             :class:`~neuprim.core.errors.ConfigError`. If the condition is one number, neuprim splits a list and calls
-            ``parse`` for each item; it expands a range itself if ``parse`` refuses it.
+            ``parse`` for each item. If ``parse`` refuses a range, neuprim expands the range itself.
         sweep: a text of ``--NAME`` that animates the condition, for commands in reports; empty for none.
-        in_frames: (text, count) -> text of the same animation with ``count`` frames; None if the text states a number
-            of frames.
-        place: function used instead of ``parse`` if the condition is a position: (text in world coordinates, world) ->
-            positions in scene units.
-        of_scene: (scene settings) -> whether the views of a scene have the condition.
+        in_frames: function (text, count) that returns the text of the same animation with ``count`` frames. It returns
+            None if the text states a number of frames already.
+        place: function used instead of ``parse`` if the condition is a position. It converts (text in world
+            coordinates, world) to positions in scene units.
+        of_scene: function (scene settings) that returns whether the views of a scene have the condition.
     """
 
     name: str
@@ -83,7 +83,7 @@ class ConditionSpec:
         return self if place is None else replace(self, parse=lambda text: place(text, world))
 
     def given(self, value: Tensor, world: World) -> Tensor:
-        """Convert a ``value`` to what users write: positions become float64 world coordinates; other values stay."""
+        """Convert ``value`` to the form that users write: float64 world coordinates of a position; else unchanged."""
         return value if self.place is None else world.world_points(value)
 
 
@@ -91,16 +91,16 @@ class ConditionSpec:
 
 
 class Field(ABC):
-    """Base class of density and colour fields, which define parameters of each primitive and what they mean."""
+    """Base class of density and colour fields, which define parameters of each primitive and their meaning."""
 
     init_settings: tuple[str, ...] = ()  # keys under model.init that the field's start values depend on
 
     stage: Hashable | None = None
-    """State besides its arguments on which ``lower`` depends, such as the number of active SH bands.
+    """State of the field, besides the arguments, that changes what ``lower`` computes, e.g. the number of SH bands.
 
-    While the state stays the same, training steps may be replayed as a CUDA graph. None: steps are never recorded.
-    A field with a stage computes with torch operations on the device alone and never waits for the device. It lowers to
-    zero density for primitives that ``active_rows`` leaves out.
+    While the stage stays the same, training may record a step as a CUDA graph and replay it. None forbids recording. A
+    field with a stage must compute with torch operations on the device only, and never wait for the device. Its
+    ``lower`` must return zero density for primitives that ``active_rows`` leaves out.
     """
 
     @abstractmethod
@@ -109,20 +109,26 @@ class Field(ABC):
 
     @abstractmethod
     def settings(self) -> dict[str, Any]:
-        """Return the constructor's arguments, JSON-able: ``type(self)(**settings)`` rebuilds the field from a file."""
+        """Return the constructor's arguments, as values for JSON; ``type(self)(**settings)`` rebuilds the field."""
 
     @classmethod
     def every_parameter(cls) -> list[ParameterSpec]:
-        """Return all parameters that the field has under any settings; presets may give learning rates for them."""
+        """Return all parameters that the field can have under any settings.
+
+        Presets may set learning rates for all these parameters.
+        """
         return cls().parameters()
 
     def set_progress(self, progress: float) -> None:  # noqa: B027 - a hook most fields do not need
-        """Set the used fraction 0..1 of the training budget, before every training step; e.g. to activate SH bands."""
+        """Set the used fraction 0..1 of the training budget; called before every training step.
+
+        A field can use the fraction to activate spherical-harmonics (SH) bands gradually.
+        """
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
         """Return the parameters of new primitives (children) that replace a split primitive (parent).
 
-        Children lie inside their parent. Inside a child, density or colour stay the same, as far as the field can.
+        Children lie inside their parent. The field keeps density or colour inside a child unchanged as far as possible.
 
         Args:
             params: this field's tensors of the parents, one row per child.
@@ -146,7 +152,10 @@ class Field(ABC):
         )
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Return disjoint groups of parameter elements, such as neurons; pruning may zero a group in any primitive."""
+        """Return disjoint groups of parameter elements, such as neurons.
+
+        Pruning may set all elements of a group to zero in any primitive.
+        """
         return ()
 
     def canonicalize(self, params: Params) -> dict[str, Tensor]:
@@ -181,7 +190,7 @@ class DensityField(Field):
 
     Attributes:
         exact_split: whether the children of a split primitive have their parent's sigma inside their own ellipsoids. If
-            not, as for Gaussians, they must hold their parent's mass, the integral of sigma over space.
+            False, as for Gaussians, the two children together must have the parent's integral of sigma over space.
     """
 
     exact_split: bool = True
@@ -208,7 +217,10 @@ class DensityField(Field):
         return {}
 
     def largest(self, params: Params, geometry: Geometry) -> Tensor | None:
-        """Return (N,) upper bounds of sigma over all points and conditions, 1/scene unit; None if unknown."""
+        """Return an (N,) upper bound of each primitive's sigma, 1/scene unit, over all points and conditions.
+
+        None if no bound is known.
+        """
         return None
 
     def active_rows(self, params: Params, conditions: Conditions) -> Tensor | None:
@@ -220,10 +232,10 @@ class DensityField(Field):
         return geometry
 
     def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
-        """Return size and opacity of primitives that replace Gaussians with the opacities ``alphas`` (N,).
+        """Return the (N,) sizes and opacities of primitives that replace Gaussians with the opacities ``alphas`` (N,).
 
-        The size is the (N,) distance from centre to edge in standard deviations of the Gaussian; opacities are (N,)
-        along a ray through the centre. The default implementation suits a constant density.
+        A size is the distance from centre to edge in standard deviations of the Gaussian. An opacity holds for a ray
+        through the centre. The default implementation suits a constant density.
         """
         return torch.full_like(alphas, math.sqrt(5.0)), alphas
 
@@ -239,13 +251,18 @@ class ColourField(Field):
         return None
 
     def isotropic(self, params: Params, conditions: Conditions) -> Tensor | None:
-        """Return the (N, C) part of the colour, at least 0, that needs neither view direction nor light; None for no
-        part."""
+        """Return the (N, C) part of the colours, at least 0, that depends on neither view direction nor light.
+
+        None if the field has no such part.
+        """
         found = self.harmonics(params, conditions)
         return None if found is None else lowest_band_colors(found[0])
 
     def scattering(self, params: Params) -> Tensor | None:
-        """Return the (N, C) radiance that primitives scatter per irradiance of a light; None if it is not separate."""
+        """Return the (N, C) radiance that primitives scatter per unit of irradiance from a light.
+
+        None if the field does not separate scattered light from the rest of the colour.
+        """
         return None
 
     @abstractmethod

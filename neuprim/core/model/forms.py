@@ -34,9 +34,10 @@ from neuprim.core.model.tensors import (
 class Cosine(PrimitiveTensors):
     """Density of a cosine network: sigma(x) = (1 - |y|^2)^p f(x~) / m inside the ellipsoid |y| < 1, 0 outside.
 
-    f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2 with x~ = (x - mu) / m, mu the centre, m the longest axis. y
-    is x in coordinates in which the ellipsoid is the unit ball. p = 0 is the hard edge of the paper; with 1 and 2,
-    density fades to 0 at the boundary (:mod:`neuprim.core.model.edge`). ``first + second`` adds two densities.
+    f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2 with x~ = (x - mu) / m, where mu is the ellipsoid's centre
+    and m its longest semi-axis. y is x in coordinates in which the ellipsoid is the unit ball. p = 0 is the hard edge
+    of the paper. With p = 1 or 2, density fades to 0 at the boundary (:mod:`neuprim.core.model.edge`).
+    ``first + second`` adds two densities.
     """
 
     shapes: ClassVar[Shapes] = {
@@ -61,8 +62,8 @@ class Cosine(PrimitiveTensors):
     def __add__(self, other: Cosine) -> Cosine:
         """Return the exact sum of two densities of the same primitives, with the neurons of both.
 
-        The result has the omega0 of the first, or of the second if the first is 0. Raises FormError for different
-        primitives or edges, or more than :data:`MOST_UNITS` neurons together.
+        The result has the omega0 of the first density, or of the second density if the first omega0 is 0. Raises
+        FormError for different primitives or edges, or more than :data:`MOST_UNITS` neurons together.
         """
         if not isinstance(other, Cosine):
             return NotImplemented
@@ -101,7 +102,7 @@ class Cosine(PrimitiveTensors):
     def optical_depth(self, pairs: PrimitiveChords) -> Tensor:
         """Return the (M,) float64 integrals of sigma along M chords, in closed form.
 
-        With a hard edge, each neuron needs one cosine and one sinc.
+        With a hard edge, the integral needs one cosine and one sinc per neuron.
         """
         prim = pairs.prim
         W1 = self.W1.double()[prim]
@@ -180,16 +181,16 @@ class Constant(PrimitiveTensors):
         return Constant(rgb if self.ambient is None else rgb + self.ambient)
 
     def chord_colours(self, pairs: PrimitiveChords) -> Tensor:
-        """Return the (M, C) float64 colours of M chords: those of their primitives."""
+        """Return the (M, C) float64 colours of M chords; a chord has the colour of its primitive."""
         return self.rgb.double()[pairs.prim]
 
     def at_primitive_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
-        """Return the (N, C) colours at the centres of the primitives; the arguments do not matter."""
+        """Return the (N, C) colours at the centres of the primitives; the colours do not depend on the arguments."""
         return self.rgb
 
     @property
     def flat(self) -> Tensor:
-        """Colours (N, C) that are valid everywhere in their primitives; None in forms whose colours vary there."""
+        """Colours (N, C) that are constant inside each primitive; None in forms whose colours vary in a primitive."""
         return self.rgb
 
 
@@ -241,9 +242,9 @@ class RayNet(PrimitiveTensors):
 
         c(pixel) = max(0, base + Wout cos(Wx . x~_m + bias)),   x~_m = (x_m - mu)/m
 
-    x_m is the middle of the chord behind the near plane, mu the primitive's centre and m its longest semi-axis. The
-    network has one hidden layer of H cosine units, H = 0 to 256. Inputs that are constant in a primitive (view
-    direction, light) are already part of ``bias``, ``Wout`` and ``base``. A colour of exactly 0 still passes its
+    x_m is the middle of the part of the chord behind the near plane, mu the primitive's centre and m its longest
+    semi-axis. The network has one hidden layer of H cosine units, H = 0 to 256. Inputs that are constant in a primitive
+    (view direction, light) are already part of ``bias``, ``Wout`` and ``base``. A colour of exactly 0 still passes its
     gradient, as with ``clamp_min``.
     """
 
@@ -277,7 +278,10 @@ class RayNet(PrimitiveTensors):
         return RayNet(self.Wx, self.bias, self.Wout * factors[:, None, None], self.base * factors[:, None])
 
     def primitive_radiance(self, prim: Tensor, local: Tensor) -> Tensor:
-        """Return (M, C) float64 colours of primitives ``prim`` (M,) at ``local``, (x - mu)/m (M, 3); differentiable."""
+        """Return the (M, C) float64 colours of primitives ``prim`` (M,) at one point each; differentiable.
+
+        ``local`` (M, 3) has the points relative to the primitives, (x - mu)/m.
+        """
         phase = (self.Wx.double()[prim] * local[:, None, :]).sum(-1) + self.bias.double()[prim]
         mixed = (self.Wout.double()[prim] * phase.cos()[:, None, :]).sum(-1)
         return (self.base.double()[prim] + mixed).clamp_min(0)
@@ -287,7 +291,7 @@ class RayNet(PrimitiveTensors):
         return self.primitive_radiance(pairs.prim, pairs.local)
 
     def at_primitive_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
-        """Return the (N, C) float64 colours at the centres of the primitives; they do not depend on ``position``."""
+        """Return the (N, C) float64 colours at the primitives' centres; the colours do not depend on ``position``."""
         middles = torch.zeros_like(geometry.means, dtype=torch.float64)
         return self.primitive_radiance(torch.arange(geometry.count, device=middles.device), middles)
 
@@ -300,17 +304,20 @@ of the whole primitive, exactly (:class:`Constant`) or approximately (:class:`Ra
 """
 
 Shade = Callable[[Tensor], Tensor]
-"""Function (scene points (M, 3), float64, that M pixels show) -> (M,) factors on the pixels' light, no gradient."""
+"""Function that maps the scene points (M, 3), float64, seen in M pixels to (M,) factors on the pixels' light.
+
+The factors have no gradient.
+"""
 
 
 @dataclass(frozen=True)
 class Shading:
-    """Factors on the colours of a frame that are computed from all primitives, such as shadows; no gradient.
+    """Factors on the colours of a frame, such as shadows, that depend on all primitives; without gradient.
 
     Attributes:
-        primitives: (M,) factors of at least 0, one per primitive of the frame; None: all are 1.
+        primitives: (M,) factors of at least 0, one per primitive of the frame; None: all factors are 1.
         pixels: function that returns one factor per pixel, from the scene point at the pixel's mean depth (deferred
-            shading); None: all are 1.
+            shading); None: all factors are 1.
     """
 
     primitives: Tensor | None = None

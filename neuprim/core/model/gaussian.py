@@ -33,8 +33,9 @@ _FAINTEST = 1e-30  # a density scaled by zero keeps a finite logarithm
 class GaussianDensity(DensityField):
     """Density field of Gaussians, sigma = kappa/m exp(-c^2 |y|^2 / 2), with one parameter, log kappa.
 
-    m is the longest semi-axis, and |y| = 1 on the ellipsoid. ``init.mode`` "opaque" (default) starts every primitive at
-    central opacity ``init.alpha``, "paper" at 0.1, as 3D Gaussian splatting does.
+    m is the longest semi-axis, and |y| = 1 on the ellipsoid. A primitive starts with the opacity of its starting point,
+    if known. Otherwise, its central opacity is ``init.alpha`` with ``init.mode`` "opaque" (default), and 0.1, as in 3D
+    Gaussian splatting, with "paper".
 
     Args:
         deviations: c, standard deviations from the centre to the edge of the support, 0.5 to 10; else ValueError.
@@ -65,22 +66,23 @@ class GaussianDensity(DensityField):
         return (depth / ctx.thickness / central).log().float()[:, None]
 
     def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
-        """Return size and opacity of primitives that replace Gaussians with the opacities ``alphas`` (N,).
+        """Return the (N,) sizes and opacities of primitives that replace Gaussians with the opacities ``alphas`` (N,).
 
-        The size, (N,), is the distance from centre to boundary, c standard deviations for all. Opacities are unchanged.
+        The size is the distance from centre to boundary in standard deviations: c for all primitives. The opacities
+        are ``alphas``, unchanged.
         """
         return torch.full_like(alphas, self.deviations), alphas
 
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> CustomDensity:
         """Return the line integral over a chord [t0, t1] in closed form, float64, differentiable in every argument.
 
-        With y the whitened chord middle, v = diag(1/s) R^T d the whitened direction d of the ray, a = v.v, u = y.v/a
-        and x = y - u v the closest approach,
+        Let y be the whitened chord middle, d the direction of the ray, v = diag(1/s) R^T d the whitened direction,
+        a = v.v, u = y.v/a, and x = y - u v the whitened point of the ray that is closest to the centre. Then
 
             I = kappa/m sqrt(2/a)/c exp(-c^2 x.x / 2) B(c sqrt(a/2) u, c sqrt(a/2) (t1 - t0)/2)
 
-        where B(u, w) is :func:`bell_integral`. The chord middle is computed relative to the primitive's centre, so the
-        other terms do not grow with the camera's distance.
+        where B(u, w) is :func:`bell_integral`. The chord middle is computed relative to the primitive's centre, so that
+        a distant camera does not make the terms large and inaccurate.
         """
         c = self.deviations
         whiten = geometry.rotations.double().transpose(1, 2) / geometry.scales.double()[:, :, None]
@@ -112,10 +114,11 @@ class GaussianDensity(DensityField):
         return peak[prim] * (-0.5 * self.deviations**2 * (y * y).sum(-1)).exp()
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
-        """Return the parameters of children with half the mass (integral of sigma over space) of their parents each.
+        """Return the parameters of children; a child has half of its parent's mass, the integral of sigma over space.
 
-        kappa'/m' prod s' = (1/2) kappa/m prod s; primes mark the child, s are the semi-axes and m is the longest one. A
-        Gaussian in a smaller ellipsoid cannot continue its parent's Gaussian, so this split changes the image.
+        kappa'/m' prod s' = (1/2) kappa/m prod s. Primes mark the child, s are the semi-axes and m is the longest
+        semi-axis. A Gaussian in a smaller ellipsoid cannot continue the parent's Gaussian, so this split changes the
+        image.
         """
         grown = (new.log_scales.double() - old.log_scales.double()).sum(-1)
         longer = new.log_length_scale.double() - old.log_length_scale.double()
@@ -137,9 +140,10 @@ class GaussianDensity(DensityField):
 def bell_integral(u: Tensor, w: Tensor) -> Tensor:
     """Return B(u, w) = integral of exp(-z^2) over [u - w, u + w], w >= 0, to a few ulp; float64, differentiable.
 
-    Three exact forms are used, each where no digits cancel (Abramowitz and Stegun 1964, 7.1 and 22.11). If the interval
-    contains 0: sqrt(pi)/2 (erf(w + u) + erf(w - u)). In one tail: sqrt(pi)/2 (erfc(|u| - w) - erfc(|u| + w)). If the
-    interval is short: the Taylor series 2 exp(-u^2) sum_k w^(2k+1) H_2k(u) / (2k+1)!, H the Hermite polynomials.
+    The function uses three exact forms, each where no digits cancel (Abramowitz and Stegun 1964, 7.1 and 22.11). An
+    interval that contains 0 has the integral sqrt(pi)/2 (erf(w + u) + erf(w - u)). An interval in one tail has
+    sqrt(pi)/2 (erfc(|u| - w) - erfc(|u| + w)). A short interval uses the Taylor series
+    2 exp(-u^2) sum_k w^(2k+1) H_2k(u) / (2k+1)!, with the Hermite polynomials H_n.
     """
     side = u.abs()
     both = torch.erf(w + u) + torch.erf(w - u)
@@ -150,8 +154,11 @@ def bell_integral(u: Tensor, w: Tensor) -> Tensor:
 
 
 def _gaussian_series(u: Tensor, w: Tensor) -> Tensor:
-    """Return :func:`bell_integral` for short intervals, by its Taylor series. The scaled polynomials P_n = w^n
-    H_n(u)/n!, H_n the Hermite polynomials, keep every term small."""
+    """Return :func:`bell_integral` for short intervals, by a Taylor series.
+
+    The series uses the scaled polynomials P_n = w^n H_n(u)/n!, H_n the Hermite polynomials, so that every term is
+    small.
+    """
     low, high = torch.ones_like(u), 2 * u * w  # P_0, P_1;  P_(n+1) = 2 (u w P_n - w^2 P_(n-1)) / (n + 1)
     total = low
     for n in range(1, 2 * _TERMS - 1, 2):

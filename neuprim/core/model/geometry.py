@@ -52,7 +52,7 @@ class Geometry(PrimitiveTensors):
 
     @property
     def log_length_scale(self) -> Tensor:
-        """Natural logarithms of the longest semi-axes, (N,). If axes are equal, the first one gets the gradient."""
+        """Natural logarithms of the longest semi-axes, (N,). Of equally long axes, only the first gets the gradient."""
         first = self.log_scales.argmax(dim=-1, keepdim=True)
         return self.log_scales.gather(-1, first)[..., 0]
 
@@ -68,7 +68,7 @@ class Geometry(PrimitiveTensors):
 
     @property
     def rotations(self) -> Tensor:
-        """Rotation matrices, (N, 3, 3); their columns are the axes of the ellipsoids in scene coordinates."""
+        """Rotation matrices, (N, 3, 3); the columns are the axes of the ellipsoids in scene coordinates."""
         return quaternion_to_matrix(self.quats)
 
     def double(self) -> Geometry:
@@ -133,9 +133,10 @@ class PrimitiveChords:
     def of(
         cls, geometry: Geometry, prim: Tensor, origin: Tensor, direction: Tensor, t0: Tensor, t1: Tensor
     ) -> PrimitiveChords:
-        """Return the chords from ray distances ``t0`` to ``t1``, (M,) each, scene units, or parts of chords.
+        """Return the M chords (or parts of chords) between the ray distances ``t0`` and ``t1``, (M,), scene units.
 
-        ``prim`` (M,) are indices into ``geometry``. Rays have the starts ``origin`` and the unit ``direction`` (M, 3).
+        ``prim`` (M,) are the indices of the primitives in ``geometry``. The rays start at ``origin``, (M, 3) or (3,),
+        and have the unit vectors ``direction`` (M, 3).
         """
         m = geometry.length_scale.double()[prim]
         middle = (t0 + t1) / 2
@@ -162,7 +163,8 @@ class PrimitiveChords:
     def support(self) -> tuple[Tensor, Tensor, Tensor]:
         """Coefficients c0, c1, c2, (M,) each, of 1 - |y|^2 = c0 + c1 u + c2 u^2 along the chords.
 
-        y is the whitened position, |y| = 1 on the ellipsoid. u runs from -1 at a chord's start to 1 at its end.
+        y is the position in whitened space, where the ellipsoid is the unit ball, so |y| = 1 on its boundary. u runs
+        from -1 at a chord's start to 1 at the chord's end.
         """
         step = self.half[:, None] * self.pace
         return 1 - self.whitened.square().sum(-1), -2 * (self.whitened * step).sum(-1), -step.square().sum(-1)

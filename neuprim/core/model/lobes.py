@@ -32,14 +32,14 @@ def lobe_colors(
     """Return the (N, C) colours of primitives with spherical Gaussian lobes, in the colour space of the images.
 
     c(d) = max(0, C0 dc + 1/2 + sum_l a_l exp(s_l (m_l . d - 1))), d the unit direction from the camera to the centre.
-    Float32 tensors are computed by one compiled kernel.
+    For float32 tensors, one compiled kernel computes all colours.
 
     Args:
         means: (N, 3) centres of the primitives, scene units.
         dc: (N, C) base colours as zero-order coefficients of spherical harmonics: C0 dc + 1/2 is the colour.
-        amplitude: (N, L, C) a_l, L from 0 to 8.
-        axis: (N, L, 3) m_l, of any length.
-        log_sharpness: (N, L) natural logarithms of s_l.
+        amplitude: (N, L, C) amplitudes a_l of the L lobes of each primitive, L from 0 to 8.
+        axis: (N, L, 3) axes m_l, of any length; the function normalises them.
+        log_sharpness: (N, L) natural logarithms of the sharpnesses s_l.
         origin: (3,) position of the camera.
 
     Raises:
@@ -93,9 +93,9 @@ def random_lobe_axes(count: int, lobes: int, generator: torch.Generator) -> Tens
 
 
 def reduce_lobes(params: Params, keep: int) -> dict[str, Tensor]:
-    """Return the parameters with the ``keep`` lobes of each primitive that vary most over the sphere of directions.
+    """Return the parameters with fewer lobes: each primitive keeps the ``keep`` lobes that vary most over directions.
 
-    The mean colours of the removed lobes over all directions are added to the base colour.
+    The mean of each removed lobe over all directions is added to the base colour.
     """
     amplitude = params[AMPLITUDE].double()
     s = params[LOG_SHARPNESS].double().clamp(-LOG_LIMIT, LOG_LIMIT).exp()

@@ -39,8 +39,8 @@ __all__ = ["ActivePrimitives", "LoweredPrimitives", "Primitives"]
 class LoweredPrimitives:
     """The renderer's input for one frame: ellipsoids with their density and colour in closed form.
 
-    Closed forms are formulas of :mod:`neuprim.core.model.forms`, in which the frame's conditions, such as the time, are
-    already applied.
+    Closed forms are formulas of :mod:`neuprim.core.model.forms`. Each formula is valid for one frame, because the
+    fields have already applied the frame's conditions, such as the time.
     """
 
     geometry: Geometry
@@ -66,7 +66,7 @@ class LoweredPrimitives:
     def check_finite(self) -> None:
         """Raise NonFiniteError for the first primitive that cannot be rendered.
 
-        Its parameters have a NaN or infinite value, a zero quaternion, or semi-axes beyond the range of float32. The
+        Such a primitive has a NaN or infinite value, a zero quaternion, or semi-axes beyond the range of float32. The
         kernels of the backends make the same check while they prepare a frame.
         """
         g = self.geometry
@@ -143,7 +143,7 @@ class LoweredPrimitives:
         )
 
     def optical_depth(self, pairs: PrimitiveChords) -> Tensor:
-        """Return the optical depths (M,) of M chords, float64: integrals of sigma along them, not clamped at 0."""
+        """Return the (M,) float64 optical depths of M chords: integrals of the extinction sigma, not clamped at 0."""
         found = self.density.optical_depth(pairs)
         return check_primitive_field_result(found, (len(pairs),), f"{self.source('density')}: line_integral").double()
 
@@ -157,7 +157,7 @@ class LoweredPrimitives:
 
 @dataclass(frozen=True)
 class ActivePrimitives:
-    """The M active primitives of a frame: those whose extinction is not zero under the frame's conditions."""
+    """The M active primitives of a frame, whose extinction is not zero under the frame's conditions."""
 
     field: DensityField
     conditions: Conditions
@@ -237,7 +237,7 @@ class Primitives:
         return self._of(field, self.params)
 
     def _of(self, field: DensityField | ColourField, params: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return those of ``params``, name -> tensor for the whole model, that belong to ``field``."""
+        """Return the entries of ``params`` (name -> tensor, for the whole model) that belong to ``field``."""
         return {name: params[name] for name in self._names[field is self.colour]}
 
     def lower(
@@ -245,10 +245,11 @@ class Primitives:
     ) -> LoweredPrimitives:
         """Return the renderer's input for one frame: ellipsoids, density and colour in closed form; differentiable.
 
-        Primitives without extinction in this frame are left out, except on a GPU if the density field has a ``stage``.
+        The result has only the primitives with extinction in this frame. On a GPU, the result has all primitives if the
+        density field has a :attr:`~neuprim.core.model.fields.Field.stage`.
 
         Args:
-            settings: render settings of images that a colour field renders itself (shadow maps); None: the defaults.
+            settings: settings for images that the colour field itself renders, such as shadow maps; None: the defaults.
             shaded: whether to apply the factors (shadows) of :meth:`~neuprim.core.model.fields.ColourField.shade`.
 
         Raises:
@@ -279,8 +280,10 @@ class Primitives:
         return active.geometry, self._lower_density(active)[0]
 
     def _lower_density(self, active: ActivePrimitives) -> tuple[LoweredDensity, Sizes]:
-        """Return the checked closed form of the density, and the sizes (such as N) that it shares with the geometry;
-        raise FormError for invalid tensors."""
+        """Return the checked closed form of the density, and the sizes (such as N) of the density's tensors.
+
+        Raises FormError for invalid tensors.
+        """
         sizes = check_geometry(active.geometry, "geometry")
         try:
             density = self.density.lower(active.own, active.geometry, active.conditions)
@@ -290,9 +293,9 @@ class Primitives:
         return density, sizes
 
     def component(self, name: str) -> Primitives:
-        """Return a model with only that part of the extinction that comes from the voxel grid ``name`` of the source.
+        """Return a model with only the extinction that comes from one voxel grid of the training data.
 
-        Raises KeyError if the density field does not know the grid.
+        ``name`` is the name of the grid. Raises KeyError if the density field does not know the grid.
         """
         own = {key: value.detach() for key, value in self.of(self.density).items()}
         scaled = self.density.scale_density(own, self.density.components(own)[name])
@@ -316,9 +319,9 @@ class Primitives:
     def active(
         self, conditions: Conditions, dtype: torch.dtype | None = None, everything: bool = False
     ) -> ActivePrimitives:
-        """Return the active primitives of a frame, those with extinction; differentiable unless ``dtype`` is given.
+        """Return a frame's active primitives, which have extinction; differentiable unless ``dtype`` is given.
 
-        With ``dtype``, tensors are detached and converted. ``everything`` includes the inactive primitives, too.
+        With ``dtype``, tensors are detached and converted. With ``everything``, the result has all primitives.
         """
         rows = None if everything else self.density.active_rows(self.of(self.density), conditions)
         params = self.params
@@ -370,8 +373,10 @@ def reduction_names(density: DensityField, colour: ColourField) -> list[str]:
 
 
 def validate_reduction(density: DensityField, colour: ColourField, kind: str, name: str, value: Any) -> int:
-    """Return ``value`` if the setting ``name`` of the field ``kind`` ("density" or "colour") can be reduced to it, e.g.
-    "neurons" of the density to 4; otherwise raise ConfigError."""
+    """Return ``value`` if a setting can be reduced to this value; otherwise raise ConfigError.
+
+    ``kind`` selects the field, "density" or "colour"; ``name`` is the setting, e.g. "neurons".
+    """
     field = density if kind == KINDS[0] else colour
     offered = field.reductions()
     if name not in offered:
@@ -387,8 +392,8 @@ def validate_reduction(density: DensityField, colour: ColourField, kind: str, na
 def reduce_model(model: Primitives, kind: str, name: str, value: int) -> Primitives:
     """Return the model with a setting of one field, e.g. its number of neurons, reduced to ``value``.
 
-    ``kind`` selects the field, "density" or "colour"; ``name`` is the setting. The result is as close to the original
-    as possible. Changed tensors are detached.
+    ``kind`` selects the field, "density" or "colour"; ``name`` is the setting. The field chooses new parameters
+    that approximate the original field. Changed tensors are detached.
     """
     own = model.density if kind == KINDS[0] else model.colour
     tensors = {key: value.detach() for key, value in model.of(own).items()}
@@ -403,9 +408,10 @@ def reduce_model(model: Primitives, kind: str, name: str, value: int) -> Primiti
 def reduce_fields(
     density: DensityField, colour: ColourField, overrides: Sequence[str]
 ) -> tuple[DensityField, ColourField]:
-    """Return both fields after the reductions ``overrides``, such as ``"density.neurons=4"``, in order.
+    """Return both fields after applying the reductions ``overrides``, such as ``"density.neurons=4"``, in order.
 
-    The texts are the setting ``model.reduced``. Fields have no parameters yet. Raises ConfigError for an invalid text.
+    ``overrides`` is the setting ``model.reduced``. Only the fields change, because a model has no parameters yet.
+    Raises ConfigError for an invalid text.
     """
     for word in overrides:
         key, equals, text = word.partition("=")

@@ -2,7 +2,7 @@
 
 Pruning decides for each primitive which units stay. A file stores a parameter NAME sparsely where that takes less
 space, as two tensors. ``NAME|there``, uint8, has one bit per element, row by row and lowest bit first; 1 means that the
-element is stored. ``NAME|numbers``, float32, holds the stored elements. All others are zero.
+element is stored. ``NAME|numbers``, float32, holds the stored elements. All other elements are zero.
 """
 
 from __future__ import annotations
@@ -42,8 +42,11 @@ def count_unit_numbers(unit: PrunableUnit, params: Params) -> int:
 
 
 def primitive_unit_removal_effect(unit: PrunableUnit, params: Params, gradients: Params) -> Tensor:
-    """Return (N,) sums of value times gradient over the elements of a unit, one sum per primitive. ``gradients`` are
-    those of a loss. To first order, setting the unit to zero changes the loss by minus this sum."""
+    """Return (N,) sums of value times gradient over the elements of a unit, one sum per primitive.
+
+    ``gradients`` are the gradients of a loss. Minus the sum is the change of the loss, to first order, when the unit of
+    this primitive becomes zero.
+    """
     slopes = unit.of(gradients)
     parts = [_flat_primitive_rows(value.detach() * slopes[name]).sum(1) for name, value in unit.of(params).items()]
     total = parts[0]
@@ -53,8 +56,11 @@ def primitive_unit_removal_effect(unit: PrunableUnit, params: Params, gradients:
 
 
 def zero_units(units: Mapping[str, tuple[PrunableUnit, Tensor]], params: Params) -> dict[str, Tensor]:
-    """Return the parameters after setting units of selected primitives to zero; changed tensors are copies. ``units``
-    maps a unit's name to (unit, (N,) bool that is True for the primitives in which the unit becomes zero)."""
+    """Return the parameters after setting units of selected primitives to zero; changed tensors are copies.
+
+    ``units`` maps a unit's name to a pair (unit, mask). The mask, (N,) bool, is True for the primitives in which the
+    unit becomes zero.
+    """
     changed = {name for unit, gone in units.values() if bool(gone.any()) for name in unit.places}
     found = {name: value.detach().clone() if name in changed else value for name, value in params.items()}
     for unit, gone in units.values():

@@ -1,7 +1,7 @@
 """Compiled CPU kernels that run per primitive: gather rows of tensors, convert quaternions, multiply by gains.
 
-A row holds the values of one primitive. Row indices must ascend, so that the backward pass writes a gradient in one
-pass.
+A row holds the values of one primitive. Row indices must ascend, so that the backward pass can fill a gradient in one
+run from the first row to the last.
 """
 
 from __future__ import annotations
@@ -21,8 +21,10 @@ _FEW = 4096  # for fewer rows without a gradient, torch is faster than starting 
 
 
 def take_primitive_rows(tensors: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-    """Return name -> the rows with the indices ``rows`` (M,) of each of the ``tensors`` (N, ...); differentiable once.
-    Tensors are float32 or float64. ``rows`` must be ascending int64; this is not checked."""
+    """Return, by name, the rows with the indices ``rows`` (M,) of each of the ``tensors`` (N, ...).
+
+    Differentiable once. Tensors are float32 or float64. ``rows`` must be ascending int64, which is not checked.
+    """
     if not device.on_numba(rows, *tensors.values()) or (len(rows) < _FEW and not kernel_needs_grad(*tensors.values())):
         return {name: value.index_select(0, rows) for name, value in tensors.items()}
     return dict(zip(tensors, apply_kernel_operation(_PrimitiveRows, rows, *tensors.values()), strict=True))
@@ -121,10 +123,10 @@ def fill_ellipsoid_rotation(q, out):  # type: ignore[no-untyped-def]
 
 @strict
 def quaternion_gradient(w, x, y, z, n, g):  # type: ignore[no-untyped-def]
-    """Return the gradient dL/dq of a loss L by a quaternion q = (w, x, y, z) with the rotation matrix R, four numbers.
+    """Return the gradient dL/dq, four numbers, of a loss L by a quaternion q = (w, x, y, z).
 
-    ``g`` holds the nine entries of dL/dR row by row, and ``n`` is 1/|q|. The result is perpendicular to q, because R
-    does not depend on |q|.
+    R is the rotation matrix of q. ``g`` holds the nine entries of dL/dR row by row, and ``n`` is 1/|q|. The result is
+    perpendicular to q, because R does not depend on |q|.
     """
     g00, g01, g02, g10, g11, g12, g20, g21, g22 = g
     w, x, y, z = w * n, x * n, y * n, z * n
@@ -138,17 +140,19 @@ def quaternion_gradient(w, x, y, z, n, g):  # type: ignore[no-untyped-def]
 
 @strict
 def ellipsoid_rotation_backward(q, n, g, out):  # type: ignore[no-untyped-def]
-    """Write the gradient dL/dq of a loss L by the quaternion ``q`` (4,) into ``out`` (4,). ``g`` (3, 3) is the gradient
-    dL/dR by the rotation matrix R of ``q``, and ``n`` is 1/|q|."""
+    """Write the gradient dL/dq of a loss L by the quaternion ``q`` (4,) into ``out`` (4,).
+
+    ``g`` (3, 3) is the gradient dL/dR of the same loss by the rotation matrix R of ``q``, and ``n`` is 1/|q|.
+    """
     rows = g[0, 0], g[0, 1], g[0, 2], g[1, 0], g[1, 1], g[1, 2], g[2, 0], g[2, 1], g[2, 2]
     out[0], out[1], out[2], out[3] = quaternion_gradient(q[0], q[1], q[2], q[3], n, rows)
 
 
 @exact_kernel
 def cosine_gain_backward(w2, b2, factor, p_w2, p_b2, g_w2, g_b2, pulled):  # type: ignore[no-untyped-def]
-    """Run the backward pass of the products w2 factor and b2 factor, for w2 (N, K), b2 (N, 1) and ``factor`` (N, 1).
+    """Run the backward pass of the products w2 * factor and b2 * factor, with w2 (N, K), b2 (N, 1), factor (N, 1).
 
-    ``p_w2`` and ``p_b2`` are the gradients of the products. The gradients of w2, b2 and the factor are written into
+    ``p_w2`` and ``p_b2`` are the gradients of the products. The kernel writes the gradients of w2, b2 and factor into
     ``g_w2``, ``g_b2`` and ``pulled``.
     """
     for n in range(b2.shape[0]):

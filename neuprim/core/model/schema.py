@@ -1,6 +1,7 @@
 """Specifications of the learnable parameters of primitives, and functions for their start values.
 
-Optimiser, population control, checkpoints and export all use one list of :class:`ParameterSpec`.
+The optimiser, population control (adding and removing primitives), checkpoints and export all use the same list of
+:class:`ParameterSpec`.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ RateUnit = Literal["absolute", "extent", "pixel"]
 """Unit of a learning rate; see :class:`ParameterSpec`."""
 
 Params = Mapping[str, Tensor]
-"""Parameter name -> tensor (N, *shape) for N primitives; ``shape`` is that of the :class:`ParameterSpec`."""
+"""Map from the name of a parameter to its tensor (N, *shape), N primitives; :class:`ParameterSpec` states ``shape``."""
 
 
 @dataclass
 class InitContext:
-    """Input of the functions that draw the start values of the parameters of N primitives.
+    """Input of the functions that draw the start values of parameters, for N primitives at N starting points.
 
     Attributes:
         means: (N, 3) initial centres, scene units.
@@ -38,7 +39,7 @@ class InitContext:
         axes: (N, 3) semi-axes of starting points that are ellipsoids.
         quats: (N, 4) wxyz orientations of starting points that are ellipsoids.
         alphas: (N,) opacities 0..1 of the starting points along a ray through their centres, if known.
-        steps: condition name -> difference of its value between neighbouring frames of a sequence.
+        steps: condition name -> difference between the condition's values in neighbouring frames of a sequence.
     """
 
     means: Tensor
@@ -54,7 +55,7 @@ class InitContext:
 
     @property
     def thickness(self) -> Tensor:
-        """Harmonic mean of the semi-axes divided by the longest one, (N,) float64; 1 for spheres."""
+        """Harmonic mean of the three semi-axes divided by the longest semi-axis, (N,) float64; 1 for spheres."""
         if self.axes is None:
             return torch.ones(self.count, dtype=torch.float64)
         axes = self.axes.double()
@@ -86,12 +87,14 @@ class ParameterSpec:
     Attributes:
         name: unique within a model; the key in checkpoints, learning rates and exports.
         shape: shape per primitive, ``()`` for a scalar.
-        lr: learning rate; ``train.rates.NAME`` overrides it. 0 means a label: not learned, stored in every file.
+        lr: learning rate; the setting ``train.rates.NAME`` overrides it. A parameter with rate 0 is a label, which is
+            stored in every file but not learned.
         init: function that draws the (N, *shape) float32 start values.
-        lr_unit: factor on the rate: "absolute", 1; "extent", the data set's
-            :attr:`~neuprim.core.data.Dataset.extent`; "pixel", the size of a pixel at the median depth of the scene.
-            ``train.rate_units.NAME`` overrides ``lr_unit``.
-        low: lower bound of the values. With 0, a value that the model clamps at 0 keeps its gradient and can rise.
+        lr_unit: name of the factor that multiplies the rate. "absolute" is the factor 1. "extent" is the data set's
+            :attr:`~neuprim.core.data.Dataset.extent`. "pixel" is the size of a pixel at the median depth of the scene.
+            The setting ``train.rate_units.NAME`` overrides ``lr_unit``.
+        low: lower bound of the values. Use 0 if the model clamps the values at 0, because values below 0 would get no
+            gradient and could not rise again.
     """
 
     name: str

@@ -47,14 +47,18 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def lowest_band_colors(dc: Tensor) -> Tensor:
-    """Return the (N, C) colours max(0, C0 dc + 1/2): the part that does not depend on direction."""
+    """Return the (N, C) colours max(0, C0 dc + 1/2), which do not depend on direction, of coefficients ``dc`` (N, C).
+
+    C0 is the spherical harmonic of degree 0, a constant.
+    """
     return (dc * C0 + 0.5).clamp_min(0.0)
 
 
 def sh_colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degree: int) -> Tensor:
-    """Return the (N, C) colours max(0, SH(direction from origin to mean) + 1/2), SH a sum of spherical harmonics.
+    """Return the (N, C) colours max(0, SH(d) + 1/2), where SH is a sum of spherical harmonics.
 
-    Float32 tensors are computed by one compiled kernel.
+    d is the unit direction from ``origin`` to the primitive's centre. For float32 tensors, one compiled kernel computes
+    all colours.
 
     Args:
         means: (N, 3) centres of the primitives, scene units.
@@ -104,7 +108,8 @@ def _check_sh_inputs(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Ten
 def truncate_sh_bands(params: Params, name: str, degree: int) -> dict[str, Tensor]:
     """Return the parameters without the spherical-harmonics bands above ``degree`` in the parameter ``name``.
 
-    On average over directions, this is the best approximation. With degree 0, the parameter is removed.
+    Spherical harmonics are orthogonal, so this is the least-squares fit over all directions (before colours are clamped
+    at 0). With degree 0, the parameter is removed.
     """
     kept = {key: value for key, value in params.items() if key != name}
     return {**kept, name: params[name][:, : sh_coefficient_count(degree) - 1].contiguous()} if degree else kept
@@ -132,6 +137,6 @@ def prunable_sh_coefficients(degree: int, channels: int, name: str) -> tuple[Pru
 def initial_sh_dc(color: Tensor) -> Tensor:
     """Return (N, C) float32 zero-order coefficients that give the colours ``color`` (N, C) in all directions.
 
-    Darker colours than 1e-3 are raised to 1e-3.
+    Colours below 1e-3 are raised to 1e-3, because a colour that is clamped at 0 would pass no gradient.
     """
     return ((color.clamp_min(_DARKEST) - 0.5) / C0).float()

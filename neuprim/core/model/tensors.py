@@ -30,8 +30,10 @@ _DTYPES = (torch.float32, torch.float64)
 
 
 def primitive_tensor_fault(value: Any) -> str | None:
-    """Return why kernels cannot read ``value``, such as ``"dtype torch.int64; expected torch.float32 or ..."``, or
-    None. Kernels read dense float32 and float64 tensors on the devices that neuprim supports."""
+    """Return an error text if kernels cannot read ``value``, such as ``"dtype torch.int64; expected ..."``, else None.
+
+    Kernels read dense float32 and float64 tensors on the devices that neuprim supports.
+    """
     if not isinstance(value, Tensor):
         return f"type {type(value).__name__}; expected a torch tensor"
     if not value.is_cpu and value.device.type not in device.DEVICE_TYPES:
@@ -60,8 +62,8 @@ def function_fault(value: Any) -> str | None:
 def primitive_tensors_fault(tensors: Iterable[tuple[str, Any, tuple[Shape, ...]]], sizes: Sizes) -> str | None:
     """Return an error text for the first tensor that kernels cannot read or that has a wrong shape, or None.
 
-    ``tensors`` holds entries (name, tensor, allowed shapes). ``sizes`` maps the letters in shapes to known sizes; the
-    sizes found are added.
+    ``tensors`` holds entries (name, tensor, allowed shapes). ``sizes`` maps the letters in shapes to known sizes. The
+    function adds each size that it finds to ``sizes``.
     """
     for name, value, shapes in tensors:
         fault = primitive_tensor_fault(value)
@@ -123,7 +125,7 @@ def _expected_primitive_shapes(shapes: tuple[Shape, ...], sizes: Sizes) -> str:
 
 
 Shapes = Mapping[str, tuple[Shape, ...]]
-"""Name of a tensor -> allowed shapes. A letter in a shape stands for the same size in all tensors of a frame."""
+"""Map from the name of a tensor to its allowed shapes. A letter stands for the same size in all tensors of a frame."""
 
 
 class PrimitiveTensors:
@@ -138,7 +140,7 @@ class PrimitiveTensors:
 
     @property
     def movable(self) -> bool:
-        """Whether :meth:`to` can move the group to another device; False if it holds a function instead of tensors."""
+        """Whether :meth:`to` can move the group to another device; False if the group has a function, not tensors."""
         return bool(self.shapes)
 
     def to(self, device: torch.device) -> Self:
@@ -148,7 +150,8 @@ class PrimitiveTensors:
     def fault(self, sizes: Sizes) -> str | None:
         """Return an error text for the first invalid tensor, ``"w2 has shape (5,); expected (100, 3), ..."``.
 
-        Returns None if all are valid. ``sizes`` maps the letters in shapes to known sizes; the sizes found are added.
+        Returns None if all tensors are valid. ``sizes`` maps the letters in shapes to known sizes; each size found is
+        added to ``sizes``.
         """
         return primitive_tensors_fault(
             [(name, getattr(self, name), shapes) for name, shapes in self.shapes.items()], sizes

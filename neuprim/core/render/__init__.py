@@ -72,7 +72,7 @@ def render(
         camera: the camera; rgb is (camera.height, camera.width, C). Only "reference" renders a :class:`RayCamera`.
         conditions: one value for each condition of the model, e.g. ``{"time": tensor(0.5)}``.
         settings: render settings; None for the defaults with ``near="auto"``.
-        background: (C,) colour behind everything; None is black.
+        background: (C,) colour behind all primitives; None means black.
 
     Raises:
         FormError: a tensor of a field, the camera or the background has a wrong shape, type or device.
@@ -97,7 +97,7 @@ def render(
 
 
 def _frame_recorder(model: Primitives, camera: AnyCamera, settings: RenderSettings) -> FrameRecorder | None:
-    """Return the recorder that replays this model's frames as CUDA graphs; None if the frames cannot be recorded."""
+    """Return the recorder that records this model's frames as CUDA graphs; None if frames cannot be recorded."""
     if model.device.type != device.CUDA or torch.is_grad_enabled():
         return None
     if [backend.name for backend in candidate_backends(settings, device.CUDA)][:1] != ["cuda"]:
@@ -147,7 +147,7 @@ def _render_checked_view(
 
 
 def probe_backend(name: str) -> str | None:
-    """Test a backend by rendering one small sphere; return None if the image is right, else what went wrong."""
+    """Render one sphere with the backend ``name``; return None if the image is correct, else what went wrong."""
     from neuprim.core.model.geometry import Geometry
 
     try:
@@ -174,8 +174,8 @@ def render_slabs(
 ) -> tuple[Tensor, Tensor]:
     """Render each slab (a group of primitives) alone; return (S, H, W) opacities and mean depths, without gradients.
 
-    S is at most ``count``: a backend may leave out slabs without primitives, whose images are 0. The others keep their
-    order.
+    S is at most ``count``, because a backend may leave out the images of slabs without primitives, which are 0. The
+    images stay in the order of the slabs.
 
     Args:
         slabs: (N,) index of the slab of each primitive, 0 to ``count`` - 1, on the primitives' device.

@@ -1,4 +1,4 @@
-"""The renderer backends and which one to use; the module of a backend is imported at its first use."""
+"""The table of renderer backends, and functions that choose one; a backend's module is imported at its first use."""
 
 from __future__ import annotations
 
@@ -44,18 +44,18 @@ class Backend:
     name: str  # value of the setting renderer.backend
     load: Callable[[], Draw]  # imports the backend and returns its render function
     unsupported: Callable[[LoweredPrimitives, AnyCamera | None], str | None] = _no_backend_fault
-    """Function of a model and a camera (None: any pinhole) that returns what the backend cannot render, as the rest of
-    a sentence that starts with "cannot draw"; None if it can render all."""
-    device_name: Callable[[], str] = _cpu_backend_name  # name of its device, for reports
+    """Function of a model and a camera (None: any pinhole camera) that returns what the backend cannot render. The text
+    completes a sentence that starts with "cannot draw". None means that the backend can render model and camera."""
+    device_name: Callable[[], str] = _cpu_backend_name  # returns the name of the backend's main device, for reports
     missing: Callable[[], str | None] = _no_backend_fault
-    """Function that returns what this machine lacks for the backend, such as a package; None if nothing. Must be
-    fast."""
-    checks: bool = False  # whether it checks that numbers are finite
+    """Function that returns what this machine lacks for the backend, such as a package; None if nothing is missing. The
+    function must be fast."""
+    checks: bool = False  # whether the backend checks that parameters are finite; if not, the renderer checks
     differentiates_intrinsics: bool = False  # whether focal lengths and principal points get gradients
-    devices: tuple[str, ...] = (hardware.CPU,)  # kinds of device that it renders on, its main one first
+    devices: tuple[str, ...] = (hardware.CPU,)  # kinds of device that the backend renders on; the first is its main one
     slabs: Callable[[], Callable[..., tuple[Tensor, Tensor]] | None] = _no_backend_fault
-    """Loads and returns the backend's function that renders all slabs (groups of primitives) in one frame; None if
-    there is none."""
+    """Function that loads and returns the backend's function to render all slabs (groups of primitives) in one frame.
+    It returns None if the backend has no such function."""
 
     def drawing_device(self, settings: RenderSettings) -> str:
         """Return the kind of device, "cpu" or "cuda", on which the backend renders with these settings."""
@@ -66,7 +66,7 @@ class Backend:
         return self.device_name() if self.drawing_device(settings) == self.devices[0] else _cpu_backend_name()
 
     def unavailable(self, device: str | None = None) -> str | None:
-        """Return why the backend cannot run here on a kind of device (None: its main one); None if it can."""
+        """Return why the backend cannot run here on ``device`` (None: its main kind of device); None if it can run."""
         device = device or self.devices[0]
         return (hardware.cuda_unavailable() if device == hardware.CUDA else None) or self.missing()
 
@@ -75,7 +75,8 @@ class Backend:
     ) -> str | None:
         """Return why the backend cannot render this model, as in "cannot run here: ..."; None if it can.
 
-        A ``camera`` of None is any pinhole. ``device`` is "cpu", "cuda" or None, the main device of the backend.
+        A ``camera`` of None means any pinhole camera. ``device`` is "cpu" or "cuda"; None means the backend's main
+        device.
         """
         device = device or self.devices[0]
         if device not in self.devices:
@@ -167,7 +168,8 @@ def find_backend(name: str) -> Backend:
 def candidate_backends(settings: RenderSettings, kind: str = hardware.CPU) -> tuple[Backend, ...]:
     """Return the backends that these settings permit for tensors on a ``kind`` of device, "cpu" or "cuda".
 
-    The renderer moves tensors from the CPU to a GPU only if the settings request a GPU.
+    The backends come in order of preference. The renderer moves tensors from the CPU to a GPU only if the settings
+    request a GPU.
     """
     if settings.backend != AUTO:
         return (find_backend(settings.backend),)
@@ -217,9 +219,9 @@ def check_render_backend(settings: RenderSettings) -> None:
 
 
 def with_available_render_backend(settings: RenderSettings) -> RenderSettings:
-    """Return the settings of a finished run such that this machine can render it again, even without a GPU.
+    """Return the settings of a finished run, changed so that this machine can render the run even without a GPU.
 
-    If no GPU works and the backend is "auto", the device "cuda" becomes "auto".
+    If no GPU works and the backend is "auto", the device "cuda" becomes "auto". Other settings do not change.
     """
     gone = settings.device == hardware.CUDA and gpu_backends_unavailable() is not None and settings.backend == AUTO
     return replace(settings, device="auto") if gone else settings
@@ -244,9 +246,10 @@ def best_render_backend_device(
 
 
 def choose_backend(lowered: LoweredPrimitives, settings: RenderSettings, camera: AnyCamera | None = None) -> Backend:
-    """Return the backend that renders this model with this camera (None: any pinhole).
+    """Return the backend that renders this model with this camera (None: any pinhole camera).
 
-    Raises BackendUnavailable if the backend of the settings cannot render it, and ConfigError for an unknown name.
+    Raises BackendUnavailable if no backend that the settings permit can render the model, and ConfigError for an
+    unknown backend name.
     """
     check_render_backend(settings)
     reasons = []

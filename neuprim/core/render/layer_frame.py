@@ -28,7 +28,10 @@ _ROUNDS = 14  # at most: thins by 8^14 = 4e12; float32 hardly needs more
 
 @dataclass(frozen=True)
 class LayerFrame:
-    """One view of a model: its image and integrals along rays, from which layers are computed; no gradients."""
+    """One view of a model, with its image and its integrals along rays, from which image layers are computed.
+
+    No value has a gradient.
+    """
 
     model: Primitives
     camera: Camera
@@ -38,7 +41,7 @@ class LayerFrame:
 
     @cached_property
     def lowered(self) -> LoweredPrimitives:
-        """The primitives of the frame: the coefficients of their densities and colours that the renderer integrates."""
+        """The primitives with the coefficients of density and colour for this frame, which the renderer integrates."""
         with torch.no_grad():
             return self.model.lower(self.camera, self.conditions, self.settings)
 
@@ -64,7 +67,10 @@ class LayerFrame:
 
     @cached_property
     def shading(self) -> Tensor | None:
-        """Mean shading factor (1: no shadow) in each pixel, (H, W), 0 where the ray hits nothing; None if unshaded."""
+        """Mean shading factor of each pixel, (H, W): 1 without shadow, 0 where the ray hits nothing.
+
+        None if the model computes no shading.
+        """
         geometry, density = self.lowered.geometry, self.lowered.density
         with torch.no_grad():
             found = self.model.colour.shade(geometry, density, self.camera, self.conditions, self.settings)
@@ -90,10 +96,11 @@ class LayerFrame:
         return self._render(replace(self.lowered, colour=colour, shade=None), self.settings).rgb
 
     def integral(self, weights: Tensor | None = None) -> Tensor:
-        """Return (H, W) sums along each ray of the primitives' optical depths, each times its weight.
+        """Return the (H, W) sum, along each ray, of weight times optical depth over all primitives.
 
-        Each optical depth covers the whole chord behind the near plane and is at least 0. ``alpha_max``, ``alpha_min``
-        and ``transmittance_min`` do not apply: the result is computed as -log of the transmittance of a thinned medium.
+        Each optical depth covers the whole chord behind the near plane and is at least 0. The settings ``alpha_max``,
+        ``alpha_min`` and ``transmittance_min`` do not limit the result, because it is computed as -log of the
+        transmittance of a medium of lower density.
 
         Args:
             weights: (N,) finite numbers of at least 0, one per primitive of :attr:`lowered`; None for 1.
@@ -113,9 +120,9 @@ class LayerFrame:
         return found if n == 1 else found.reshape(self.camera.height, n, self.camera.width, n).mean((1, 3))
 
     def _thin(self, transmittance: Callable[[float], Tensor]) -> Tensor:
-        """Return the optical depth -log of ``transmittance(1)``; ``transmittance(x)`` renders x times the density.
+        """Return the optical depth of each pixel; ``transmittance(x)`` renders the pixels with x times the density.
 
-        For opaque pixels, compute it at lower densities and scale it up.
+        The optical depth is -log(``transmittance(1)``), or -log(``transmittance(x)``)/x with x < 1 for opaque pixels.
         """
         T = transmittance(1.0)
         found, opaque, factor = _depth_of_transmittance(T), T <= _CLEAR, 1.0
@@ -144,7 +151,7 @@ class LayerFrame:
 
 
 def _depth_of_transmittance(transmittance: Tensor) -> Tensor:
-    """Return the float64 optical depth -log T; T counts as at least the smallest normal number of its dtype."""
+    """Return the float64 optical depth -log T, with T clamped to at least the smallest normal number of its dtype."""
     return -transmittance.clamp_min(torch.finfo(transmittance.dtype).tiny).double().log()
 
 
@@ -156,10 +163,10 @@ class LayerSpec:
     """One layer of the files that ``neuprim render --format exr`` writes.
 
     Attributes:
-        name: what the user types after ``--layers``, and the prefix of the channels: letters, digits, _.
-        summary: one line with meaning and unit of the values; it is also written into the file.
-        draw: function of a :class:`LayerFrame` that returns (H, W, C) finite values, or (H, W) for one channel; or None
-            if the model of the frame has no such layer.
+        name: what the user types after ``--layers``, and the prefix of the channel names; letters, digits and _.
+        summary: one line with meaning and unit of the values; the summary is also written into the file.
+        draw: function of a :class:`LayerFrame` that returns (H, W, C) finite values, or (H, W) for one channel. It
+            returns None if the model of the frame has no such layer.
         channels: names of the channels; empty for a layer of light. A layer of light has the channels of the task's
             images, over black and premultiplied by alpha. It is summed over the lights of an environment and needs
             linear colours.
@@ -177,7 +184,7 @@ class LayerSpec:
 
 
 LIGHTS = "lights"
-"""Name with which ``--layers`` selects the layers of all single lights, ``light_000`` and so on, if several are on."""
+"""Name with which ``--layers`` selects one layer per light (``light_000`` and so on), if several lights are on."""
 
 COMMON: tuple[LayerSpec, ...] = (
     LayerSpec("beauty", "the image, linear light, premultiplied by alpha", lambda frame: frame.drawn.rgb),
@@ -204,9 +211,9 @@ def select_layers(text: str | None, own: Sequence[LayerSpec], several: bool) -> 
 
     Args:
         text: names separated by commas, or None.
-        own: the layers of the task, beside the common ones.
-        several: whether several lights are on. If so, only the task's layers of light can be selected besides the
-            common ones.
+        own: the layers that the task adds to the common layers (:data:`COMMON`).
+        several: whether several lights are on. If so, only common layers and the task's layers of light can be
+            selected.
 
     Raises:
         ConfigError: an unknown name, or no name.

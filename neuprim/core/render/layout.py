@@ -2,8 +2,9 @@
 
 A pixel kernel reads one float32 row of numbers per primitive (ellipsoid). The backward pass writes one row of gradients
 (a gradient row) per (tile, primitive) pair; a tile has 16 x 16 pixels. Column numbers are constants, so that LLVM can
-vectorise. The CUDA kernels pack float32 rows in float4 columns (:mod:`neuprim.core.render.cuda.layout`). Their float64
-rows and gradient rows have the columns below. The float32 bounds were measured with benchmarks/numerics.py.
+vectorise. The float32 rows of CUDA kernels consist of float4 columns (:mod:`neuprim.core.render.cuda.layout`). The
+float64 rows and gradient rows of CUDA kernels have the columns below. benchmarks/numerics.py measured the float32
+bounds.
 """
 
 from __future__ import annotations
@@ -73,5 +74,5 @@ MIN_RIM_SHARES = tuple(MIN_RIM ** (p + 0.5) for p in EDGES)  # share of the larg
 
 
 def min_visible_depth(alpha_min: float) -> float:
-    """Return the optical depth below which samples (ray x primitive) are skipped: that of ``alpha_min``, less 1 %."""
+    """Return the optical depth below which samples (ray x primitive) are skipped: 99 % of that of ``alpha_min``."""
     return -float(np.log1p(-alpha_min)) * VISIBLE_SHARE

@@ -23,8 +23,8 @@ from neuprim.core.render.layer_frame import LayerFrame, LayerSpec
 from neuprim.core.settings import RenderSettings
 
 VISIBILITY = ("none", "primitive", "pixel")
-"""Where the light's visibility (1: lit, 0: in shadow) is computed: nowhere, at the primitives' centres, or at the mean
-depth of each pixel."""
+"""Where the visibility of the light (1: lit, 0: in shadow) can be computed: nowhere, at the centres of the primitives,
+or at the mean depth of each pixel."""
 
 # ---------------------------------------------------------------- directions
 
@@ -46,7 +46,7 @@ def check_typical_light(typical: float) -> None:
 def light_factor(geometry: Geometry, conditions: Conditions, typical: float, falloff: bool) -> Tensor:
     """Return the (N, C) light intensity at N primitives, divided by the intensity ``typical``.
 
-    With ``falloff``, it is also divided by the squared distance from the light to the primitive's centre.
+    With ``falloff``, the result is also divided by the squared distance from the light to the primitive's centre.
     """
     means = geometry.means
     strength = device.to_device_like(conditions["light_intensity"], means) / typical
@@ -64,9 +64,9 @@ VOLUME_SIZE, VOLUME_LAYERS = 48, 16  # for smoke, which is smooth and shadows it
 
 FADE, EXTENTS, PIXEL_FADE = 1 / 50, 1.5, 1 / 10
 """Distances over which light fades behind a depth image of a shadow map. At a primitive, the distance is FADE scene
-diameters plus EXTENTS times the primitive's own extent towards the light. At a pixel, it is PIXEL_FADE scene diameters.
-Surfaces made of ellipsoids are bumpy: if light fades faster, the bumps shadow each other; if slower, shadows detach
-from their casters. A point on a depth image itself keeps all of its light."""
+diameters plus EXTENTS times the primitive's own extent towards the light. At a pixel, the distance is PIXEL_FADE scene
+diameters. Surfaces made of ellipsoids are bumpy: with shorter distances, the bumps shadow each other; with longer
+distances, shadows detach from their casters. A point at the depth of the depth image keeps all of its light."""
 
 _FAR = 1e3  # scene radii; beyond, all rays are parallel, and float32 depths lose all digits
 _CHUNK = 1024  # points per unit of work
@@ -75,9 +75,10 @@ _CHUNK = 1024  # points per unit of work
 def shade_by_light(
     where: str, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
 ) -> Shading | None:
-    """Return the visibility of the light, a factor on colours; None if ``where`` (:data:`VISIBILITY`) is "none".
+    """Return the visibility of the light, a factor on colours; None if ``where`` is "none".
 
-    With "primitive", visibility is computed at the primitives' centres; with "pixel", at the mean depth of each pixel.
+    ``where`` is one of :data:`VISIBILITY`. With "primitive", the visibility is computed at the primitives' centres;
+    with "pixel", at the mean depth of each pixel.
     """
     if where == "none":
         return None
@@ -91,9 +92,10 @@ def shade_by_light(
 def shade_volume_by_light(
     geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
 ) -> Shading:
-    """Return the visibility of the light at the primitives' centres, for overlapping primitives as in smoke.
+    """Return the visibility of the light at the primitives' centres, for overlapping primitives such as smoke.
 
-    The light crosses slabs (ranges of depth from the light), and each absorbs gradually over about its own depth.
+    The primitives are sorted into slabs (ranges of depth from the light). Each slab absorbs light gradually, around its
+    mean depth, over a distance of 1/VOLUME_LAYERS of the scene's diameter.
     """
     visible = light_visibility(geometry, density, conditions["light"], settings, VOLUME_SIZE, VOLUME_LAYERS)
     return Shading(primitives=visible(geometry.means, 1 / VOLUME_LAYERS, before=0.5))
@@ -101,9 +103,9 @@ def shade_volume_by_light(
 
 @torch.no_grad()
 def extents_towards(geometry: Geometry, point: Tensor) -> Tensor:
-    """Return the (N,) extent of each ellipsoid in the direction from its centre to ``point`` (3,), in scene units.
+    """Return the (N,) extent of each ellipsoid along the direction from its centre to ``point`` (3,), in scene units.
 
-    The extent is the distance between the two tangent planes perpendicular to this direction.
+    The extent is the distance between the two planes that touch the ellipsoid and are perpendicular to this direction.
     """
     towards = device.to_device_like(point, geometry.means) - geometry.means
     units = normalize_direction(towards, geometry.detached_length_scale[:, None])
@@ -114,10 +116,11 @@ def extents_towards(geometry: Geometry, point: Tensor) -> Tensor:
 
 
 class Visibility(Protocol):
-    """Function of scene points (M, 3) that returns (M,) float32 visibility of a light, 0 to 1.
+    """Function of scene points (M, 3) that returns the (M,) float32 visibility of a light, 0 to 1, at the points.
 
-    At a slab (primitives at similar depth from the light), light fades over ``fade`` scene diameters plus (M,) ``more``
-    scene units. The fraction ``before`` of this distance lies before the slab's mean depth, the rest behind.
+    A slab is a group of primitives at similar depth from the light. At each slab, light fades over a distance of
+    ``fade`` scene diameters plus ``more`` (M,) scene units. The fraction ``before`` of this distance lies before the
+    slab's mean depth, the rest behind.
     """
 
     def __call__(self, points: Tensor, fade: float, more: Tensor | None = None, before: float = 0.0) -> Tensor: ...
@@ -134,18 +137,20 @@ def light_visibility(
     """Return the function that gives the visibility of a point light (3,), computed by layered shadow maps.
 
     The primitives are sorted into ``layers`` slabs by depth from the light. Each slab is rendered alone, as an image of
-    ``size`` x ``size`` pixels with opacity A_k and mean depth d_k. The light's transmittance at a point x of depth z is
+    ``size`` x ``size`` pixels with opacity A_k and mean depth d_k. The visibility of the light at a point x of depth z
+    is the transmittance
 
         V(x) = prod_k (1 - A_k s((z - d_k)/fade + before)),      s a smooth step from 0 at 0 to 1 at 1.
 
-    With ``before`` = 0, V is exactly 1 where nothing lies in front, and 1 - A well behind an object of opacity A. A
-    single slab would be an ordinary shadow map. Its one depth per pixel is a mean, between a translucent object and the
-    floor below it. Inverse depths, weighted by opacity, are interpolated bilinearly. This is exact on planes, so that a
-    lit floor does not shadow itself at grazing light. V carries no gradient.
+    fade is the distance over which light fades at a slab; for ``before`` see :class:`Visibility`. With ``before`` = 0,
+    V is exactly 1 where nothing lies in front, and 1 - A well behind an object of opacity A. A single slab would be an
+    ordinary shadow map. The depth of such a map is one mean per pixel, between a translucent object and the floor below
+    it. Inverse depths, weighted by opacity, are interpolated bilinearly. The interpolation is exact on planes, so that
+    a lit floor does not shadow itself at grazing light. V has no gradient.
 
-    The light's camera looks at the middle of all centres and sees all of them. A light among the primitives also looks
-    at that middle; points behind the light count as lit. The depth images are rendered with the backend and threads of
-    the frame's ``settings``.
+    The light's camera looks at the middle of all centres. The camera sees all centres, unless the light is among the
+    primitives or close to them. Points behind the light count as lit. The depth images are rendered with the backend
+    and threads of the frame's ``settings``.
     """
     if not geometry.count:
         return lambda points, fade, more=None, before=0.0: torch.ones(len(points), device=points.device)
@@ -206,9 +211,10 @@ def sample_visibility(
 ) -> Tensor:
     """Return the (M,) float32 visibility of a light at ``points`` (M, 3) float64; the torch version, for GPUs.
 
-    ``alphas`` and ``depths`` (slabs, S, S) are the images of the shadow maps, ``view`` the (3, 4) matrix from scene to
-    light. Points with a depth of at most ``near`` are lit; ``focal`` is in pixels. ``fades`` (M,) are the distances
-    over which light fades at a slab, of which the fraction ``before`` lies before its mean depth.
+    ``alphas`` and ``depths`` (slabs, S, S) are the images of the shadow maps. ``view`` is the (3, 4) matrix from scene
+    to light camera, ``focal`` the camera's focal length in pixels. Points with a depth of at most ``near`` are lit.
+    ``fades`` (M,) are the distances over which light fades at a slab. The fraction ``before`` of each distance lies
+    before the slab's mean depth.
     """
     nearness = torch.where(alphas > 0, alphas.double() / depths.double().clamp_min(near), 0.0)
     images = torch.stack([alphas.double(), nearness], 1)  # (slabs, 2, S, S)
@@ -225,7 +231,10 @@ def sample_visibility(
 
 
 def interleave_shadow_maps(alphas: np.ndarray, depths: np.ndarray, near: float) -> np.ndarray:
-    """Return (S + 2, S + 2, 2, slabs) float64: opacity, and opacity over depth, of each pixel; 0 around the images."""
+    """Return each pixel's opacity and opacity / depth as a float64 array (S + 2, S + 2, 2, slabs) with a border of 0.
+
+    ``alphas`` and ``depths`` (slabs, S, S) are the images of the shadow maps; depths count as at least ``near``.
+    """
     slabs, size, _ = alphas.shape
     maps = np.zeros((size + 2, size + 2, 2, slabs))
     maps[1:-1, 1:-1, 0] = np.moveaxis(alphas, 0, -1)
@@ -237,7 +246,8 @@ def interleave_shadow_maps(alphas: np.ndarray, depths: np.ndarray, near: float) 
 def _visibility_kernel(start, stop, points, view, near, focal, maps, fades, before, found):  # type: ignore[no-untyped-def]
     """Write the visibility of a light at points ``start:stop`` into ``found``; see :func:`sample_visibility`.
 
-    ``maps`` is the result of :func:`interleave_shadow_maps`: LLVM vectorises the loops over slabs.
+    ``maps`` is the result of :func:`interleave_shadow_maps`. Its last axis is the slabs, so that LLVM vectorises the
+    loops over slabs.
     """
     size, slabs = maps.shape[0] - 2, maps.shape[3]
     passed = np.empty(slabs)

@@ -21,9 +21,10 @@ _MIN_NEAR = 1e-6  # share of the typical depth, in case a point lies at a camera
 
 
 def nearest_and_median_depth(means: Tensor, cameras: Sequence[AnyCamera]) -> tuple[float, float]:
-    """Return (nearest, median) depth of points (N, 3) in the cameras that see them; ray distance for ``RayCamera``.
+    """Return (nearest, median) depth of points (N, 3) in the pinhole cameras that see the points.
 
-    If no camera sees any point, the distances of all points from all cameras are used instead.
+    If no pinhole camera sees any point, the function uses the distances of all points from all cameras instead. Large
+    sets of points and cameras are subsampled.
     """
     means = means.detach().double().cpu()[:: max(len(means) // _MAX_POINTS, 1)]
     cameras = [
@@ -41,7 +42,7 @@ def nearest_and_median_depth(means: Tensor, cameras: Sequence[AnyCamera]) -> tup
 
 
 def near_plane_extent(extent: float, means: Tensor, cameras: Sequence[AnyCamera]) -> float:
-    """Return ``extent``, or the median depth of points (N, 3) if this depth is over 100 times as large."""
+    """Return ``extent``; if the median depth of points (N, 3) is over 100 times ``extent``, return this depth."""
     _, depth = nearest_and_median_depth(means, cameras)
     return extent if extent >= _MIN_EXTENT * depth else depth
 
@@ -49,7 +50,7 @@ def near_plane_extent(extent: float, means: Tensor, cameras: Sequence[AnyCamera]
 def typical_pixel_size(means: Tensor, cameras: Sequence[AnyCamera], extent: float) -> float:
     """Return the size of a pixel, in scene units, at the median depth of points (N, 3); at most 1/250 of ``extent``.
 
-    Uses the median focal length of the cameras. Without cameras that have one, returns 1/250 of ``extent``.
+    Uses the median focal length of the pinhole cameras. Without pinhole cameras, returns 1/250 of ``extent``.
     """
     _, depth = nearest_and_median_depth(means, cameras)
     focal = sorted(camera.fx for camera in cameras if isinstance(camera, Camera))
@@ -58,7 +59,7 @@ def typical_pixel_size(means: Tensor, cameras: Sequence[AnyCamera], extent: floa
 
 
 def resolve_near(settings: RenderSettings, means: Tensor, cameras: Sequence[AnyCamera]) -> RenderSettings:
-    """Return the settings with ``near="auto"`` replaced by a distance, chosen from the depths of points (N, 3)."""
+    """Return the settings with ``near="auto"`` replaced by a near plane chosen from the depths of points (N, 3)."""
     if settings.near != "auto":
         return settings
     if not len(means):

@@ -21,8 +21,10 @@ from neuprim.core.settings import RenderSettings
 class Contributions:
     """How much each of N primitives contributes to the image of a frame; 0 until the backward pass fills the values."""
 
-    weight: Tensor  # (N,) sum over pixels of alpha_i T_i; positive exactly for visible primitives
-    error_weight: Tensor  # (N,) sum over pixels of alpha_i T_i x error
+    # (N,) sum over pixels of alpha_i T_i: the opacity of primitive i times the transmittance in front of it; positive
+    # exactly for visible primitives
+    weight: Tensor
+    error_weight: Tensor  # (N,) sum over pixels of alpha_i T_i x error of the pixel
     rows: Tensor | None = None  # (N,) rows of the model, if some primitives were left out of the frame
 
     def of_all(self, count: int) -> tuple[Tensor, Tensor]:
@@ -53,11 +55,14 @@ class ContributionRequest:
 
     error: Tensor  # error of each ray, in the shape of the frame as the backend drew it
     result: Contributions
-    rays: int = 1  # per pixel; sums are divided by it, so that frames with different numbers are comparable
-    sums: tuple[Tensor, Tensor] | None = None
+    rays: int = 1  # rays per pixel; divides the sums, so that frames with different ray counts are comparable
+    sums: tuple[Tensor, Tensor] | None = None  # (N,) sums of weights and of weights x error over the blocks so far
 
     def add(self, rows: Tensor, weight: Tensor, error_weight: Tensor) -> None:
-        """Add (R,) sums over one block of rays for primitives ``rows`` (R,), for backends that render in blocks."""
+        """Add the (R,) sums over one block of rays for primitives ``rows`` (R,), then update ``result``.
+
+        Backends that render in blocks call this method once per block.
+        """
         if self.sums is None:
             blank = torch.zeros_like(self.result.weight, device=rows.device)
             self.sums = blank, blank.clone()
@@ -80,12 +85,12 @@ class RenderStats:
 
     backend: str  # name of the backend
     count: int  # number of primitives of the frame
-    # evaluated pairs of tile and primitive (cpu, cuda) or ray and primitive (reference); the room for them in a frame
-    # that is replayed as a CUDA graph
+    # number of evaluated pairs: tile and primitive (cpu, cuda), or ray and primitive (reference). In a frame that is
+    # replayed as a CUDA graph: number of pairs for which the arrays have room
     pairs: int = 0
     rows: Tensor | None = None  # rows of the model, if some primitives were left out of the frame
     samples: int = 1  # rays per pixel side
-    drawn_on: torch.device | None = None  # device of the backend, if not that of the tensors
+    drawn_on: torch.device | None = None  # device of the backend, if it differs from the device of the tensors
     contributions: ContributionRequest | None = None  # see RenderOutput.request_contributions
     extra: dict[str, Any] = field(default_factory=dict)  # further data of the backend
 
@@ -106,8 +111,8 @@ class RenderOutput:
 
     rgb: Tensor  # (H, W, C) in the model's colour space, composited over the background
     alpha: Tensor  # (H, W) accumulated opacity 1 - T
-    # (H, W) weighted mean camera-z (ray distance for a RayCamera) of the chord middles, 0 where nothing is hit; None
-    # without the setting depth
+    # (H, W) weighted mean camera-z (ray distance for a RayCamera) of the middles of the ray's chords, 0 where the ray
+    # hits nothing; None without the setting depth
     depth: Tensor | None
     stats: RenderStats
 
@@ -135,14 +140,17 @@ def mean_depth(weighted: Tensor, alpha: Tensor) -> Tensor:
 
 
 Draw = Callable[..., RenderOutput]
-"""Type of a backend's function ``render(lowered, camera, background, settings)``. Backends support different
-cameras."""
+"""Type of a backend's function ``render(lowered, camera, background, settings)``. The cameras that the function accepts
+depend on the backend."""
 
 
 def draw_pixel_samples(
     draw: Draw, lowered: LoweredPrimitives, camera: Camera, background: Tensor | None, settings: RenderSettings
 ) -> RenderOutput:
-    """Render with ``settings.samples`` ** 2 rays per pixel; average rgb and alpha, and depth weighted by alpha."""
+    """Render with ``settings.samples`` ** 2 rays per pixel; return the means over each pixel.
+
+    The mean of depth is weighted by alpha.
+    """
     n = settings.samples
     fine = draw(lowered, camera.resized(camera.width * n, camera.height * n), background, replace(settings, samples=1))
     alpha = _average_pixel_samples(fine.alpha, n)
@@ -158,7 +166,7 @@ def _average_pixel_samples(image: Tensor, n: int) -> Tensor:
 
 
 def unproject_rendered_depth(depth: Tensor, camera: AnyCamera) -> Tensor:
-    """Return the (H, W, 3) float64 scene point at the depth (H, W) of each pixel; no gradient."""
+    """Return the (H, W, 3) float64 scene point on each pixel's ray at the pixel's ``depth`` (H, W); no gradient."""
     depth = depth.detach().double()
     view = device.to_device_like(camera.viewmat.detach(), depth)
     if isinstance(camera, RayCamera):
@@ -173,7 +181,8 @@ def unproject_rendered_depth(depth: Tensor, camera: AnyCamera) -> Tensor:
 def draw_shaded_view(draw: Draw) -> Draw:
     """Return a draw function that shades the image of ``draw`` pixel by pixel, for example with shadows.
 
-    It multiplies the image over black by ``lowered.shade``, evaluated at the scene point of each pixel's mean depth.
+    The returned function multiplies the image over black by ``lowered.shade``, a factor evaluated at the scene point of
+    each pixel's mean depth.
     """
 
     def shaded(
@@ -198,7 +207,10 @@ def draw_shaded_view(draw: Draw) -> Draw:
 
 
 def draw_on_device(draw: Draw, place: torch.device) -> Draw:
-    """Return a draw function that renders on the device ``place`` and moves the result back; differentiable."""
+    """Return a draw function that renders on the device ``place``, then moves the result to the model's device.
+
+    The returned function is differentiable.
+    """
 
     def moved(
         lowered: LoweredPrimitives, camera: AnyCamera, background: Tensor | None, settings: RenderSettings

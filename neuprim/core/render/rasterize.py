@@ -1,7 +1,8 @@
-"""Shared code of the cpu and cuda backends: call a backend's :class:`torch.autograd.Function` and return its gradients.
+"""Shared code of the cpu and cuda backends: call a backend's :class:`torch.autograd.Function` and pass gradients on.
 
-The function's ``forward`` takes ``(ctx, request, viewmat, background, palette, *tensors)``. ``palette`` has the (N, C)
-colours. ``tensors`` are the tensors named in :data:`PARAMETERS` and, for colour networks, those named in ``NET``.
+``forward`` of a backend's function takes ``(ctx, request, viewmat, background, palette, *tensors)``. ``palette`` holds
+the (N, C) colours. ``tensors`` are the tensors that :data:`PARAMETERS` names and, for colour networks, the tensors that
+``NET`` names.
 """
 
 from __future__ import annotations
@@ -32,12 +33,12 @@ class RasterRequest:
     """All inputs of one frame for the cpu or cuda backend that are not tensors."""
 
     camera: Camera
-    turns: float  # omega0 / 2 pi of the density
-    edge: int  # exponent p
+    turns: float  # omega0 / 2 pi of the density; converts frequencies and phases to turns
+    edge: int  # exponent p of the density's edge, see neuprim.core.model.edge
     settings: RenderSettings
     stats: RenderStats
     differentiable: bool = False  # whether a backward pass may follow
-    capacity: Any = None  # sizes of the frame's arrays, for a backend that need not count them
+    capacity: Any = None  # fixed sizes of the frame's arrays; None: the backend counts what the arrays must hold
 
     @classmethod
     def of(
@@ -89,19 +90,19 @@ def rasterize(
 
 
 def remember_rasterizer_inputs(ctx: Any, inputs: Sequence[Tensor]) -> None:
-    """Save device and dtype of each input in ``ctx``, for :func:`rasterizer_input_gradients`.
+    """Save the device and dtype of each input in ``ctx``, for :func:`rasterizer_input_gradients`.
 
-    Also make autograd pass None instead of zeros for outputs that have no gradient.
+    Also make autograd pass None instead of zeros to ``backward`` for each output that has no gradient.
     """
     ctx.inputs_like = [(x.device, x.dtype) for x in inputs]
     ctx.set_materialize_grads(False)  # without a gradient, the depth image adds no cost
 
 
 def rasterizer_input_gradients(ctx: Any, view: Tensor | None, gradients: Sequence[Tensor | None]) -> tuple[Any, ...]:
-    """Return the tuple that ``backward`` must return: one gradient per input, with the input's dtype and device.
+    """Return the tuple that ``backward`` must return: None for the request, then one gradient per input tensor.
 
-    ``view`` is the (3, 4) gradient of the camera's rotation and translation (R | t). ``gradients`` has one gradient for
-    each input after ``viewmat``.
+    Each gradient gets the dtype and device of its input. ``view`` is the (3, 4) gradient of the camera's rotation and
+    translation (R | t). ``gradients`` has one gradient for each input after ``viewmat``.
     """
     full = None
     if view is not None:

@@ -1,6 +1,6 @@
-"""The reference backend: the closed form of the method in plain torch, in float64, with autograd.
+"""The reference backend: the closed-form integral of the method in plain torch, in float64, with autograd.
 
-The other backends are tested against the reference.
+Tests compare the other backends with the reference backend.
 """
 
 from __future__ import annotations
@@ -24,7 +24,10 @@ _BLOCK = 32  # pixels per side of a block; limits memory, does not change result
 
 
 class _FlooredSqrt(torch.autograd.Function):
-    """sqrt(D) with the derivative taken at max(D, floor), because it grows as D^-1/2 at a silhouette, where D = 0."""
+    """sqrt(D), whose backward pass takes the derivative at max(D, floor).
+
+    The exact derivative grows as D^-1/2 without bound towards a silhouette, where D = 0.
+    """
 
     @staticmethod
     def forward(ctx: Any, D: Tensor, floor: float) -> Tensor:
@@ -39,7 +42,10 @@ class _FlooredSqrt(torch.autograd.Function):
 
 
 class _Contributions(torch.autograd.Function):
-    """Identity on the compositing weights of a block of rays; its backward pass sums each primitive's contributions."""
+    """Identity on the compositing weights of a block of rays, whose backward pass sums each primitive's contributions.
+
+    The sums go to ``stats.contributions``.
+    """
 
     @staticmethod
     def forward(ctx: Any, weights: Tensor, rows: Tensor, pixels: Tensor, stats: RenderStats) -> Tensor:
@@ -58,7 +64,7 @@ class _Contributions(torch.autograd.Function):
 
 
 class _PreparedPrimitives:
-    """Geometry of all primitives of one view, in float64: centres and axes in camera coordinates."""
+    """Centres and axes of all primitives of one view, in camera coordinates and float64."""
 
     def __init__(self, lowered: LoweredPrimitives, camera: AnyCamera) -> None:
         g = lowered.geometry
@@ -81,7 +87,10 @@ class _PreparedPrimitives:
 def render(
     lowered: LoweredPrimitives, camera: AnyCamera, background: Tensor | None, settings: RenderSettings
 ) -> RenderOutput:
-    """Render in float64; return a frame of the model's dtype. See ``Draw`` in :mod:`neuprim.core.render.output`."""
+    """Render in float64; return a frame of the model's dtype.
+
+    For the arguments see ``Draw`` in :mod:`neuprim.core.render.output`.
+    """
     frame = _PreparedPrimitives(lowered, camera)
     count = lowered.geometry.count
     seen = frame_rays(camera, lowered.geometry, frame.center, settings.near_plane)
@@ -209,8 +218,8 @@ class ReferenceRays:
     """Rays from the camera centre, in float64."""
 
     directions: Tensor  # (..., 3) unit vectors in camera axes; a zero vector meets nothing
-    near: Tensor  # (...) ray distance of the near plane, which cuts chords, scene units
-    depth: Tensor  # (...) depth per unit of ray distance
+    near: Tensor  # (...) distance along the ray to the near plane, in scene units; chords begin there at the earliest
+    depth: Tensor  # (...) depth divided by distance along the ray
 
 
 class FrameRays(ABC):
@@ -221,10 +230,13 @@ class FrameRays(ABC):
 
     @abstractmethod
     def touched(self, y: int, x: int, h: int, w: int) -> Tensor:
-        """Return (N,) bool; False only if no ray of the h x w pixels from corner (y, x) hits the primitive."""
+        """Return (N,) bool: whether a ray of the h x w pixels from corner (y, x) may hit each primitive."""
 
     def block(self, y: int, x: int, h: int, w: int) -> tuple[ReferenceRays, Tensor]:
-        """Return the rays of the h x w pixels from corner (y, x), and primitives that they may hit, front to back."""
+        """Return the rays of the h x w pixels from corner (y, x), and the primitives that these rays may hit.
+
+        The primitives are (R,) rows, front to back.
+        """
         window, r = (slice(y, y + h), slice(x, x + w)), self.rays
         rays = ReferenceRays(
             r.directions[window].reshape(-1, 3), r.near[window].reshape(-1), r.depth[window].reshape(-1)
@@ -242,7 +254,7 @@ def pixel_ray_directions(camera: Camera) -> Tensor:
 
 
 class _PinholeRays(FrameRays):
-    """Rays of a pinhole camera; near plane, depth and order are in camera-z; culling is by exact screen boxes."""
+    """Rays of a pinhole camera: near plane, depth and order are in camera-z, and culling uses exact screen boxes."""
 
     def __init__(self, camera: Camera, geometry: Geometry, center: Tensor, near: float) -> None:
         d = pixel_ray_directions(camera)
@@ -257,7 +269,10 @@ class _PinholeRays(FrameRays):
 
 
 class _CentralRays(FrameRays):
-    """Rays of a RayCamera; near plane, depth and order are distances; culling is by a cone around each block's rays."""
+    """Rays of a RayCamera: near plane, depth and order are distances from the camera.
+
+    Culling compares a cone around the rays of a block with the cone around each primitive's bounding sphere.
+    """
 
     def __init__(self, camera: RayCamera, geometry: Geometry, center: Tensor, near: float) -> None:
         d = camera.directions.double()
@@ -296,10 +311,11 @@ def frame_rays(camera: AnyCamera, geometry: Geometry, center: Tensor, near: floa
 def screen_boxes(geometry: Geometry, camera: Camera, near: float) -> Tensor:
     """Return the (N, 4) float64 pixel bounds (x0, y0, x1, y1) of each ellipsoid's projection.
 
-    In the plane of image axis i and the optical axis z, the tangents are x_i/z = (k +- sqrt(D))/(z^2 - S_zz) with k =
-    c_i z - S_iz, D = z^2 S_ii - 2 c_i z S_iz + c_i^2 S_zz - (S_ii S_zz - S_iz^2), S = B diag(s^2) B^T. In camera axes,
-    c is the ellipsoid's centre (depth z) and B its orientation; s are its semi-axes. An ellipsoid cut by the near plane
-    gets the whole screen, an ellipsoid behind it an empty box (x1 < x0).
+    In camera axes, c is the ellipsoid's centre, z its depth and B the orientation; s are the semi-axes. With
+    S = B diag(s^2) B^T, the tangents in the plane of image axis i and the optical axis are x_i/z =
+    (k +- sqrt(D))/(z^2 - S_zz), where k = c_i z - S_iz and D = z^2 S_ii - 2 c_i z S_iz + c_i^2 S_zz -
+    (S_ii S_zz - S_iz^2). An ellipsoid that the near plane cuts gets the whole screen. An ellipsoid wholly before the
+    near plane gets an empty box (x1 < x0).
     """
     view = camera.viewmat.detach().double()
     R = view[:3, :3]

@@ -1,8 +1,8 @@
 """A trainer for training one model on several ranks (processes), each of which holds the whole model.
 
-Every rank draws the same random numbers for all views of a step, but renders only its own views. It receives the sum of
-the gradients of all views, added in a fixed order. All ranks then make the same update, population control included. R
-ranks with V views per step give the same bits as one process with R x V views per step.
+Every rank draws the same random numbers for all views of a step, but renders only its own views. Then every rank gets
+the sum of the gradients of all views, added in a fixed order. So all ranks make the same update and the same population
+control. R ranks with V views per step give the same bits as one process with R x V views per step.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from neuprim.core.train.trainer import Trainer
 from neuprim.core.train.training_views import hash_training_views
 
 _ALIGNMENT = 16
-"""Alignment of the tensors in an exchange buffer, in float32 numbers. 16 numbers are 64 bytes, which vector units read
-at once."""
+"""Alignment of the tensors in an exchange buffer, in float32 numbers: 16 numbers are 64 bytes, as much as a vector unit
+reads at once."""
 
 
 class _RankMessage(NamedTuple):
     """Message that a rank sends to all other ranks in each step.
 
     Attributes:
-        checksum: checksum of the primitives' positions before the step; a difference reveals a rank that computes
-            differently.
+        checksum: checksum of the primitives' positions before the step. If the checksums of two ranks differ, the ranks
+            compute differently.
         elapsed: seconds of training; all ranks use the value of rank 0.
-        stop: whether this rank was asked to stop.
+        stop: whether the rank was asked to stop.
         present: for each parameter, whether it has a gradient on this rank.
         views: results of the rank's views, in order.
     """
@@ -58,7 +58,8 @@ class DistributedTrainer(Trainer):
         group: connection to the other ranks.
 
     Raises:
-        ConfigError: as Trainer, and for ``train.supervision=voxels``, which uses no views to divide among ranks.
+        ConfigError: as for Trainer; also for ``train.supervision=voxels``, because such a training uses no views that
+            could be divided among the ranks.
     """
 
     def __init__(
@@ -89,7 +90,7 @@ class DistributedTrainer(Trainer):
         """Check that all ranks start with the same settings, data and parameters.
 
         Raises:
-            RankError: a rank differs; names the rank and what differs.
+            RankError: a rank differs; the message names the rank and the difference.
         """
         views, digest = self.dataset.train, hashlib.sha256()
         for name, value in sorted(self.state()[0].items()):
@@ -108,7 +109,8 @@ class DistributedTrainer(Trainer):
         """Take one training step with the other ranks, as :meth:`~neuprim.core.train.trainer.Trainer.train_step`.
 
         Raises:
-            RankError: another rank ended or computes differently. This trainer then has the state from before the step.
+            RankError: another rank ended or computes differently. The state of this trainer is then the same as before
+                the step.
         """
         order, generator = self.order, self.generator.get_state()
         try:
@@ -121,11 +123,11 @@ class DistributedTrainer(Trainer):
 
     @property
     def stopping(self) -> bool:
-        """Whether any rank was asked to stop before the last step ran; all ranks return the same."""
+        """Whether any rank had been asked to stop when the ranks combined the last step; the same on all ranks."""
         return self._stopping
 
     def _draw_views(self) -> list[ViewTask]:
-        """Draw the views of all ranks for one step; return those of this rank."""
+        """Draw the views of all ranks for one step; return the views of this rank."""
         drawn = [self._draw_view() for _ in range(self.settings.views_per_step * self.ranks)]
         own = drawn[self.rank :: self.ranks]
         after = int(self.order[self.rank]) if len(self.order) > self.rank else None
@@ -165,7 +167,10 @@ class DistributedTrainer(Trainer):
         return every, self._sums.finish(self.model.params, present)
 
     def _stop_clock(self, start: float) -> float:
-        """Return rank 0's training time in :meth:`_combine_views`; the rest of the step counts for the next step."""
+        """Return the training time of rank 0, measured in :meth:`_combine_views`.
+
+        The rest of the step counts for the next step.
+        """
         self._after = time.perf_counter() - self._agreed_at
         return self._agreed
 
@@ -178,10 +183,10 @@ def _pad_gradient_exchange(numbers: int) -> int:
 class GradientSum:
     """Sum of gradients and contributions over the views of all ranks, in the order of the views.
 
-    The order of additions in an all-reduce is not fixed, which changes the bits. Here every rank owns a slice of a flat
-    buffer. The rank receives its slice from every view, and adds the views one after the other, as a single process
-    does. Then it sends the sum to the other ranks. This moves as many bytes as a ring all-reduce. The buffers are
-    reused, because allocating new memory pages takes as long as sending them.
+    An all-reduce is not used, because its order of additions is not fixed, which changes the bits. Instead, every rank
+    owns a slice of a flat buffer. The rank receives this slice of every view's gradients, and adds the views one after
+    the other, as a single process does. Then the rank sends the sum to the other ranks. This moves as many bytes as a
+    ring all-reduce. The buffers are reused, because allocating a buffer takes as long as sending it.
     """
 
     def __init__(self, params: Mapping[str, Tensor], group: ProcessGroup) -> None:
@@ -207,9 +212,7 @@ class GradientSum:
     def add(self, params: Mapping[str, Tensor], contributions: Contributions) -> list[bool]:
         """Add the gradients of one view of every rank, in rank order, and the primitives' contributions to these views.
 
-        Clears ``.grad`` of ``params``.
-
-        Returns, for each parameter, whether it had a gradient on this rank.
+        Clear ``.grad`` of ``params``. Return for each parameter whether it had a gradient on this rank.
         """
         present = []
         for value, part in zip(params.values(), self._gradients, strict=True):

@@ -28,12 +28,13 @@ _USUAL_OPACITY = 0.5
 def initial_model_to_train(
     density: DensityField, colour: ColourField, dataset: Dataset, settings: ModelSettings, seed: int
 ) -> Primitives:
-    """Return an untrained model on starting points; a primitive's size is the RMS distance to its 3 nearest points.
+    """Return an untrained model with primitives at the starting points of a data set.
 
-    ``model.init.points`` chooses the points: "matter" (the points of the data set), "box" (random in the data set's
-    box), or a .ply file of points or 3D Gaussians in the coordinate system of the data files. Gaussians also set sizes,
-    orientations and opacities. ``model.init.scale`` multiplies all sizes. ``model.init.surroundings``, 0 by default, is
-    the fraction of the primitives placed where photographs show something and the data set has no points.
+    A primitive's size is the RMS distance from its point to the 3 nearest points. ``model.init.points`` chooses the
+    points: "matter" (the points of the data set), "box" (random in the data set's box), or a .ply file of points or 3D
+    Gaussians in the coordinate system of the data files. Gaussians also set sizes, orientations and opacities.
+    ``model.init.scale`` multiplies all sizes. ``model.init.surroundings``, 0 by default, is the fraction of the
+    primitives placed where photographs show something and the data set has no points.
 
     Raises:
         ConfigError: a setting does not exist or has an invalid value.
@@ -88,7 +89,7 @@ def initial_model_to_train(
 def _add_initial_surroundings(
     cloud: PointCloud, dataset: Dataset, settings: ModelSettings, generator: torch.Generator
 ) -> PointCloud:
-    """Return ``cloud`` with some points replaced by points on visible surfaces that it does not cover.
+    """Return ``cloud`` with some points replaced by points on visible surfaces where ``cloud`` has no points.
 
     The setting ``model.init.surroundings`` is the fraction to replace.
     """

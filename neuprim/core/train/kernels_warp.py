@@ -1,7 +1,8 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Warp kernels for training steps on a GPU: Adam (two launches per parameter), and L1 + SSIM with its gradient (four).
+"""Warp kernels for training steps on a GPU: Adam, and the L1 + SSIM loss with its gradient.
 
-For the derivation of SSIM's gradient see :mod:`neuprim.core.train.ssim_cpu`. Importing this module imports Warp.
+Adam takes two launches per parameter, the loss four launches. :mod:`neuprim.core.train.ssim_cpu` derives the gradient
+of SSIM. Importing this module imports Warp.
 """
 
 import functools
@@ -20,7 +21,7 @@ from neuprim.core.train.ssim_cpu import SSIM_TAPS, SSIM_WINDOW
 
 @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
 def check_adam_gradient(grad: Floats, refused: Ints):
-    """Set the flag ``refused`` if a number of ``grad`` is NaN or infinite; one thread per number."""
+    """Set the flag ``refused`` if a number in ``grad`` is NaN or infinite; one thread per number."""
     if not wp.isfinite(grad[wp.tid()]):
         refused[0] = 1  # whichever thread writes it
 
@@ -33,8 +34,8 @@ def take_adam_step(
     """Take an Adam step in place unless the flag ``refused`` is set; one thread per number of ``value``.
 
     ``first`` and ``second`` are Adam's moments. A row (the numbers of one primitive) has ``width`` numbers; ``age``
-    counts its steps before this one. The learning rate is ``rates[parameter]``. ``rest1`` and ``rest2`` are 1 -
-    ``beta1`` and 1 - ``beta2``, rounded once; ``log1`` and ``log2`` are the logarithms of the betas.
+    counts the steps of each row before this one. The learning rate is ``rates[parameter]``. ``rest1`` and ``rest2`` are
+    1 - ``beta1`` and 1 - ``beta2``, rounded once. ``log1`` and ``log2`` are the logarithms of ``beta1`` and ``beta2``.
     """
     i = wp.tid()
     if refused[0] == 0:
@@ -62,7 +63,7 @@ def adam_rows(
         values, grads, firsts, seconds: lists of P float32 tensors (N, ...), none empty, contiguous except ``grads``.
             ``firsts`` and ``seconds`` are Adam's moments.
         rates: (P,) float32, the learning rates.
-        age: (N,) int64, steps of each row (primitive) before this one; grows by 1.
+        age: (N,) int64, number of steps of each row (primitive) before this step; grows by 1 unless ``refused`` is set.
         betas: decays of the first and of the second moment.
         refused: (1,) int32 flag.
     """
@@ -111,9 +112,10 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
     def compare(
         rows: wp.array3d(dtype=_vec5), window: _Window, S: wp.array3d(dtype=float), maps: wp.array3d(dtype=wp.vec3)
     ):
-        """Blur ``rows`` vertically and compute SSIM of the images a and b from it, into ``S`` (H - 10, W - 10, C).
+        """Blur ``rows`` vertically and compute the SSIM of the images a and b from it, into ``S`` (H - 10, W - 10, C).
 
-        ``maps`` gets the derivatives of SSIM with respect to the window means of a, a^2 and ab.
+        ``rows`` is the result of ``along_rows``. ``maps`` gets the derivatives of SSIM with respect to the window means
+        of a, a^2 and ab.
         """
         y, x, c = wp.tid()
         total = _vec5()
@@ -148,9 +150,9 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
     ):  # fmt: skip
         """Write |a - b| into ``difference``, and the gradient of the loss with respect to ``a`` into ``grad``.
 
-        ``columns`` has the derivatives of SSIM after the adjoint of the vertical blur; the horizontal one is applied
-        here. ``by_l1`` is the weight of L1 over (pixels x channels), ``by_ssim`` that of SSIM over (windows x
-        channels).
+        ``columns`` has the derivatives of SSIM after the adjoint of the vertical blur; this kernel applies the adjoint
+        of the horizontal blur. ``by_l1`` is the weight of L1 over (pixels x channels), ``by_ssim`` the weight of SSIM
+        over (windows x channels).
         """
         y, x, c = wp.tid()
         total = wp.vec3()

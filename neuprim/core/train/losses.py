@@ -1,8 +1,9 @@
 """Losses for images and for points in a volume, and regularisers of the primitives' sizes.
 
-Images: the photometric loss, (1 - lambda) L1 + lambda (1 - SSIM), and three for linear light of high dynamic range.
-Each function that makes a loss takes the settings of a :class:`~neuprim.core.extensions.LossExtension` or of a task's
-``loss``. Image losses need no masks: masked pixels are made equal in both images.
+The losses for images are the photometric loss, (1 - lambda) L1 + lambda (1 - SSIM), and three losses for linear light
+of high dynamic range. Each function that makes a loss takes the settings that a
+:class:`~neuprim.core.extensions.LossExtension` or a task's ``loss`` gets. Image losses need no masks, because the
+trainer makes masked pixels equal in both images.
 """
 
 from __future__ import annotations
@@ -34,13 +35,15 @@ _DARK = 0.05
 _ROWS = 65_536  # primitives whose distances from all cameras are in memory at once
 
 _COMPONENT_WEIGHT = 0.1
-"""Weight of the loss of an extinction's components, its parts from single source grids. This loss trains the share of
-each component in a primitive. Shares are learned equally fast with any weight; with this one, primitives hardly
-move."""
+"""Weight of the loss of the extinction's components, which are the parts of the extinction from single source grids.
+This loss trains the share of each component in a primitive. Shares are learned equally fast with any weight; this
+weight is so small that the loss hardly moves primitives."""
 
 
 def photometric_reference(rendered: Tensor, truth: Tensor, ssim_weight: float) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the photometric loss and its parts by kornia and autograd, on any device; the reference for the kernels.
+    """Return the photometric loss and its parts, computed by kornia and autograd on any device.
+
+    Tests compare the fast kernels with this function. :func:`photometric` uses it where the fast kernels do not apply.
 
     Args:
         rendered: (H, W, C) rendered image, values nominally in 0..1.
@@ -103,7 +106,10 @@ def l1(settings: Mapping[str, Any]) -> Loss:
 
 
 def compressed_loss(settings: Mapping[str, Any]) -> Loss:
-    """Return a function for the L1 loss of log(1 + mu x) / log(1 + mu), mu = 16, which gives shadows more weight."""
+    """Return a function for the L1 loss of log(1 + mu x) / log(1 + mu), where x are the images and mu = 16.
+
+    The logarithm gives shadows more weight.
+    """
 
     def measure(rendered: Tensor, truth: Tensor) -> Tensor:
         scale = torch.log1p(torch.tensor(_MU))
@@ -114,7 +120,10 @@ def compressed_loss(settings: Mapping[str, Any]) -> Loss:
 
 
 def relative_loss(settings: Mapping[str, Any]) -> Loss:
-    """Return a function for the loss squared error / detached squared rendered value (Mildenhall 2022, RawNeRF)."""
+    """Return a function for the loss mean ((rendered - true) / (rendered + 0.05))^2 (Mildenhall 2022, RawNeRF).
+
+    The denominator gets no gradient; negative rendered values count as 0 in it.
+    """
 
     def measure(rendered: Tensor, truth: Tensor) -> Tensor:
         return ((rendered - truth) / (rendered.detach().clamp_min(0.0) + _DARK)).square().mean()
@@ -155,7 +164,7 @@ class PointLossResult:
     def contributions(self) -> Contributions:
         """Return the sums over the points of each primitive's extinction, and of its extinction times the error.
 
-        The backward pass computes them, so call this method afterwards.
+        Call this method after the backward pass, which computes the sums.
         """
         return Contributions(self.shares.weight, self.shares.error_weight, self.rows)
 
@@ -168,10 +177,10 @@ class PointLossResult:
 def point_loss(model: Primitives, samples: PointSamples, settings: TrainSettings, threads: int = 0) -> PointLossResult:
     """Return the loss of a model's extinction and source radiance against known values at points.
 
-    The loss sums mean squared errors, each error divided by its scale. With ``train.supervision=both``, squared errors
-    of the extinction are also divided by 1 + extinction/scale: images do not show what lies deep in dense matter.
-    Weights: 1 for the extinction, a small one for each extinction component, ``train.voxel_colour`` for the source
-    radiance and for the scattered radiance.
+    The loss is a weighted sum of mean squared errors, each error divided by a scale from ``samples``. With
+    ``train.supervision=both``, squared errors of the extinction are also divided by 1 + true extinction / scale. This
+    lowers the weight of dense matter, because images do not show its inside. The weights are 1 for the extinction, 0.1
+    for each extinction component, and ``train.voxel_colour`` for the source radiance and for the scattered radiance.
     """
     colour = samples.source is not None and settings.voxel_colour > 0
     found = volume_values_at(model, samples.conditions, samples.points, colour, threads)
@@ -201,7 +210,7 @@ def point_loss(model: Primitives, samples: PointSamples, settings: TrainSettings
 
 
 def scale_anisotropy(log_scales: Tensor) -> Tensor:
-    """Return the mean over primitives of std(s / min s), s the three semi-axes; 0 for spheres.
+    """Return the mean over primitives of std(s / min s), where s are the three semi-axes; 0 for spheres.
 
     This is the regulariser of the authors of the method.
     """
@@ -212,9 +221,9 @@ def scale_anisotropy(log_scales: Tensor) -> Tensor:
 class MaxScreenSize:
     """Limits the largest semi-axis of each primitive to a fraction of its distance to the nearest training camera.
 
-    A primitive close to one camera covers few pixels of other cameras, so images alone do not stop its growth. It
-    learns the mean colour of what is behind it. From a camera between two training cameras, it then covers the whole
-    image. A distant primitive may be large.
+    A primitive close to one camera covers few pixels of other cameras, so images alone do not stop its growth. Such a
+    primitive learns the mean colour of the scene behind it. From a camera between two training cameras, the primitive
+    then covers the whole image. A distant primitive may be large.
 
     Args:
         share: upper bound of largest semi-axis / distance.
@@ -230,9 +239,9 @@ class MaxScreenSize:
         return step % self.every == 0
 
     def apply(self, means: Tensor, log_scales: Tensor, when: Tensor | None = None) -> None:
-        """Shrink primitives that exceed the limit, all three axes by one factor, in place in ``log_scales`` (N, 3).
+        """Shrink primitives that exceed the limit, in place in ``log_scales`` (N, 3), all three axes by one factor.
 
-        ``when`` is (1,) bool on the device; if it is False, nothing changes.
+        ``when`` is (1,) bool on the device; if ``when`` is False, no primitive changes.
         """
         with torch.no_grad():
             if device.on_numba(means):

@@ -1,8 +1,8 @@
 """Adam optimizer with a step count for each primitive (row of a parameter), instead of one count for all.
 
-Population control creates primitives in the middle of a run, with zero moments. With one count for all, the first step
-of a new primitive would be 3.2 times its learning rate (method: "splitting exactly"). So Adam's bias correction uses
-the primitive's own count.
+Population control creates primitives in the middle of a run, with zero moments. If all primitives had the same count,
+the first step of a new primitive would be 3.2 times its learning rate. So Adam's bias correction uses the primitive's
+own count.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ def _adam_rows(start, stop, width, value, grad, m, v, rate, beta2, age, breaks, 
     """Take an Adam step on rows start:stop of flat float32 arrays, ``width`` numbers per row.
 
     The step is that of :func:`adam_step_reference`. ``correction[age]`` is 1 / (1 - BETA1^age) and ``root[age]`` is
-    sqrt(1 / (1 - beta2^age)). ``breaks`` are the rows whose ``age`` differs from the row before. Neighbouring rows
-    mostly have the same age. So the rows between two breaks are updated in one long loop, which vectorises.
+    sqrt(1 / (1 - beta2^age)). ``breaks`` are the rows whose ``age`` differs from the age of the row before. Most
+    neighbouring rows have the same age, so the rows between two breaks are updated in one long loop, which vectorises.
     """
     b1, b2, eps = np.float32(BETA1), np.float32(beta2), np.float32(EPS)
     one_b1, one_b2 = np.float32(1 - BETA1), np.float32(1 - beta2)
@@ -69,7 +69,10 @@ def _adam_rows(start, stop, width, value, grad, m, v, rate, beta2, age, breaks, 
 
 @exact_kernel
 def _largest_gradient_bits_of_step(x):  # type: ignore[no-untyped-def]
-    """Return the largest bit pattern of |x| in float32 ``x``: at least that of infinity if x is not finite."""
+    """Return the largest bit pattern of the absolute values in a float32 array, as uint32.
+
+    The result is at least the bit pattern of infinity exactly if a value is NaN or infinite.
+    """
     bits = x.view(np.uint32)
     largest = np.uint32(0)
     for k in range(bits.shape[0]):  # a maximum of integers vectorises, a sum of floats does not
@@ -88,8 +91,8 @@ def _all_gradients_finite(gradients: list[Tensor]) -> bool:
 def _bias_corrections(beta2: float, ages: int) -> tuple[np.ndarray, np.ndarray]:
     """Return two tables of Adam's bias correction, by age (number of steps of a row) from 0 to ``ages`` - 1.
 
-    The tables are 1 / (1 - BETA1^age) and sqrt(1 / (1 - beta2^age)), with 0 for age 0. They are cached, because the
-    powers take longer than the rest of a row's step.
+    The tables are 1 / (1 - BETA1^age) and sqrt(1 / (1 - beta2^age)), with 0 for age 0. The tables are cached, because
+    the powers take longer than the rest of the Adam step of a row.
     """
     age = np.arange(1.0, ages)
     return np.append(0.0, 1 / (1 - BETA1**age)), np.append(0.0, np.sqrt(1 / (1 - beta2**age)))
@@ -127,7 +130,7 @@ class RowAdam:
             rates: learning rate by parameter name.
 
         Raises:
-            NonFiniteError: a gradient is NaN or infinite. Nothing is changed; the message names parameter and
+            NonFiniteError: a gradient is NaN or infinite. No parameter changes; the message names the parameter and the
                 primitive.
         """
         updates = self._updates(params, rates)
@@ -146,7 +149,8 @@ class RowAdam:
 
         Args:
             rates: (P,) float32, learning rate of each parameter, in the order of ``specs``.
-            refused: (1,) int32 flag. If it is set, nothing is changed. A gradient that is NaN or infinite sets it.
+            refused: (1,) int32 flag. A gradient that is NaN or infinite sets the flag. If the flag is set, no parameter
+                changes.
         """
         updates = self._updates(params, {spec.name: rate for spec, rate in zip(self.specs, rates, strict=True)})
         self._step_on_gpu(updates, torch.stack([update.rate for update in updates]), refused)
@@ -203,8 +207,8 @@ class RowAdam:
     def select(self, rows: Tensor, fresh: Tensor) -> None:
         """Apply a population change to moments and step counts.
 
-        New primitive i takes the numbers of old primitive ``rows[i]``, or zeros where ``fresh[i]``. If the number of
-        primitives stays the same, the tensors keep their memory.
+        New primitive i takes the moments and step count of old primitive ``rows[i]``, or zeros if ``fresh[i]`` is true.
+        If the number of primitives stays the same, the tensors keep their memory.
         """
         self.age = _select_rows(self.age, rows, fresh)
         for moments in (self.m, self.v):

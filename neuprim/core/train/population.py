@@ -22,23 +22,25 @@ from neuprim.core.train.settings import PopulationSettings
 
 SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS = 0.5, 0.6, 0.9
 """Shape of a child relative to its parent: distance of the centres over the parent's longest semi-axis, factor on that
-axis, factor on the other two.
+semi-axis, factor on the other two semi-axes.
 
-A child has its parent's density only inside its own ellipsoid. Density that no child covers is lost; density that both
-cover counts twice. These numbers cover 78 % of the parent and overlap in 2 %. Five other shapes trained no better."""
+A child has its parent's density only inside its own ellipsoid. Density outside of both children is lost; density inside
+both children counts twice. With these numbers, the children cover 78 % of the parent and overlap in 2 %. Five other
+shapes trained no better."""
 
 SPLIT_GAUSSIAN = 1 / 1.6
-"""Factor on all semi-axes of a child in :class:`GradientPopulation`, as the authors of the method use it. It is the
-rule of 3D Gaussian splatting (Kerbl et al. 2023): the inverse of 0.8 times the number of children. Such children cover
+"""Factor on all semi-axes of a child in :class:`GradientPopulation`. The authors of the method use this factor, which
+follows 3D Gaussian splatting (Kerbl et al. 2023): the inverse of 0.8 times the number of children. Such children cover
 45 % of their parent."""
 
 _GROWTH = 0.25
-"""Share of the primitives that one intervention (change of the population) adds. A split costs quality that training
-has to recover. More primitives are added if their number would otherwise not reach ``grow_to``."""
+"""Share of the primitives that one intervention (change of the population) adds. The share is small, because each
+split lowers the quality until training recovers it. An intervention adds more primitives if their number would
+otherwise not reach ``grow_to``."""
 
 _MIN_GROWTHS = 3
-"""Number of equal parts of the time from ``start`` to ``stop``. Primitives are added at least at the boundaries between
-the parts, even if a part is shorter than ``every`` steps."""
+"""Number of equal parts of the time from ``start`` to ``stop``. :class:`RelocatePopulation` adds primitives at least at
+the boundaries between the parts, even if a part is shorter than ``every`` steps."""
 
 
 def split_population(
@@ -47,8 +49,9 @@ def split_population(
     """Split each of P parent primitives in two; return the parameters of the children, name -> (2 P, ...).
 
     The first children of all parents come first, then all second children. Each child continues its parent's density
-    (exactly with a hard edge) and colour. The children's centres lie on the parent's longest axis, at +-``shift`` x the
-    semi-axis from its centre. This semi-axis is multiplied by ``long_factor``, the other two by ``other_factor``.
+    (exactly with a hard edge) and colour. The children's centres lie on the parent's longest axis, at a distance of
+    ``shift`` x the longest semi-axis from the parent's centre, on opposite sides. The longest semi-axis is multiplied
+    by ``long_factor``, the other two semi-axes by ``other_factor``.
 
     Args:
         parents: (P,) indices of the parents in ``model``.
@@ -78,7 +81,7 @@ def split_population(
 
 @dataclass(frozen=True)
 class PopulationChange:
-    """Result of an intervention: a new set of N primitives, and the old primitive that each comes from.
+    """Result of an intervention: N new primitives, and for each new primitive the old primitive it comes from.
 
     Attributes:
         params: parameter name -> (N, ...) values.
@@ -96,8 +99,8 @@ class PopulationChange:
 class Population(ABC):
     """Base class of population control strategies, which add, move and remove primitives during a training.
 
-    A strategy collects statistics in every step (:meth:`observe`). After the steps that :meth:`due` selects, it changes
-    the primitives (:meth:`intervene`).
+    A strategy collects statistics in every step (:meth:`observe`), and changes the primitives after the steps that
+    :meth:`due` selects (:meth:`intervene`).
     """
 
     def __init__(self, settings: PopulationSettings) -> None:
@@ -110,15 +113,18 @@ class Population(ABC):
 
     @abstractmethod
     def observe(self, model: Primitives, contributions: Contributions) -> None:
-        """Add a step to the statistics, after its backward passes and before ``.grad`` is cleared."""
+        """Add one step to the statistics. Call this method after the backward passes, before ``.grad`` is cleared."""
 
     def sums(self) -> tuple[Tensor | None, ...]:
-        """Return the tensors in which :meth:`observe` adds up statistics, or None for each that does not exist yet."""
+        """Return the tensors in which :meth:`observe` sums statistics; None for each tensor that does not exist yet."""
         return ()
 
     @abstractmethod
     def intervene(self, model: Primitives, extent: float) -> PopulationChange | None:
-        """Return the new primitives, or None for no change, and reset the statistics; ``extent`` is the scene's."""
+        """Return the new primitives, or None for no change, and reset the statistics.
+
+        ``extent`` is the extent of the scene, in scene units.
+        """
 
     def state(self) -> dict[str, Tensor]:
         """Return the strategy's statistics as tensors, for a checkpoint."""
@@ -141,12 +147,13 @@ class FixedPopulation(Population):
 class RelocatePopulation(Population):
     """Strategy that moves primitives of little weight to where the error is largest, and adds primitives.
 
-    A primitive's weight is the sum over pixels of alpha T, its share of the pixel. Its error is the same sum, with each
-    term multiplied by the pixel's error. The primitives with the largest errors split in two. One child replaces its
-    parent, the other replaces a primitive with little weight; ``idle`` limits which ones. While there are fewer than
-    ``grow_to`` primitives, further ones split, and their second children are added. An intervention adds a quarter of
-    all primitives, or more if the remaining interventions would not reach ``grow_to``. If the budget is too short for
-    ``every``, interventions are more frequent.
+    A primitive's weight is the sum over pixels of alpha T, the primitive's share of the pixel. A primitive's error is
+    the same sum, with each term multiplied by the pixel's error. The primitives with the largest errors split in two.
+    One child replaces its parent, the other child replaces a primitive with little weight. If the setting ``idle`` is
+    given, only primitives with a weight below ``idle`` x the mean weight are replaced. While there are fewer than
+    ``grow_to`` primitives, further primitives split, and their second children are added. An intervention adds a
+    quarter of all primitives, or more if the remaining interventions would not reach ``grow_to``. If the budget is too
+    short for ``every``, interventions are more frequent.
     """
 
     def __init__(self, settings: PopulationSettings) -> None:
@@ -217,7 +224,8 @@ class RelocatePopulation(Population):
     def _count_births(self, count: int) -> int:
         """Return how many primitives to add: a quarter of ``count``, or more if needed to reach ``grow_to``.
 
-        If more are needed, each remaining intervention multiplies the number by the same factor.
+        In the second case, each remaining intervention multiplies the number of primitives by the same factor. The
+        result is at most the number that is missing.
         """
         missing = max((self.settings.grow_to or 0) - count, 0)
         due = math.ceil(count * ((1 + missing / count) ** (1 / (self._remaining + 1)) - 1) - 1e-9)
@@ -240,8 +248,9 @@ def _split_population_into_rows(
 ) -> PopulationChange:
     """Return the change that splits each of the primitives ``parents`` (P,) into two children.
 
-    The first child takes the row (index) of its parent, the second a row in ``others`` (P,), and replaces what is
-    there. The last ``births`` rows in ``others`` are new. ``text`` describes the change, for logs.
+    The first child takes the row (index) of its parent. The second child takes a row from ``others`` (P,), and
+    replaces the primitive in that row. The last ``births`` rows in ``others`` are new, so their children replace
+    nothing. ``text`` describes the change, for logs.
     """
     children = split_population(model, parents, SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS)
     rows = torch.cat([parents, others])
@@ -259,11 +268,11 @@ def _split_population_into_rows(
 class GradientPopulation(Population):
     """Strategy of the authors of the method: clone, split and remove primitives by the gradient of the density network.
 
-    A primitive's g is the gradient norm of its density parameters, |dW1| + |db1| + |dw2| + |db2|. It is averaged over
-    the steps whose views show the primitive. A primitive with g >= grow_threshold is cloned if its longest semi-axis is
-    <= clone_scale x extent: both copies stay in place and have half the density. Larger ones are split in two, with
-    semi-axes / 1.6 (:func:`split_population`). A primitive is removed if g < prune_threshold, if its longest semi-axis
-    is > prune_scale x extent, or if no view shows it.
+    A primitive's g is the gradient norm of its density parameters, |dW1| + |db1| + |dw2| + |db2|, as a mean over the
+    steps whose views show the primitive. A primitive with g >= grow_threshold is cloned if its longest semi-axis is <=
+    clone_scale x the scene's extent. Both copies stay in place and have half the density. A larger primitive with g >=
+    grow_threshold is split in two, with semi-axes / 1.6 (:func:`split_population`). A primitive is removed if g <
+    prune_threshold, if its longest semi-axis is > prune_scale x the scene's extent, or if no view shows the primitive.
     """
 
     def __init__(self, settings: PopulationSettings) -> None:
@@ -339,7 +348,7 @@ STRATEGIES: dict[str, type[Population]] = {
     "relocate": RelocatePopulation,
     "gradient": GradientPopulation,
 }
-"""Value of ``train.population.strategy`` -> its class."""
+"""Value of ``train.population.strategy`` -> class of the strategy."""
 
 
 def check_strategy(name: object) -> None:

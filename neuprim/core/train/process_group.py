@@ -26,8 +26,8 @@ class TorchrunRank:
     """Rank of this process among the processes that torchrun started.
 
     Attributes:
-        rank, size: number of this process, and number of processes on all machines.
-        local_rank, local_size: the same, counting only processes on this machine.
+        rank, size: index of this process, from 0, and number of processes on all machines.
+        local_rank, local_size: index and number that count only the processes on this machine.
         address: host and port where the processes connect.
     """
 
@@ -78,14 +78,14 @@ MEETING = timedelta(minutes=5)
 """Longest time that ranks wait for the last rank to start."""
 
 TIMEOUT = timedelta(hours=12)
-"""Longest time that a rank waits for another one, which may be generating data or evaluating. If a rank ends, its
-connections break at once, and torchrun ends the other ranks."""
+"""Longest time that a rank waits for another rank, which may be generating data or evaluating. The time can be long,
+because if a rank ends, its connections break at once, and torchrun ends the other ranks."""
 
 _FAILED = "failed"  # key of the store: the first failure of any rank
 
 
 class ProcessGroup:
-    """The connected ranks of a training; the methods communicate among all of them.
+    """The connected ranks (processes) of a training; the methods communicate among all ranks.
 
     Args:
         place: rank of this process.
@@ -120,7 +120,7 @@ class ProcessGroup:
     # ------------------------------------------------------------ communication
 
     def gather(self, value: Any) -> list[Any]:
-        """Return the list of ``value`` of all ranks, in the order of ranks.
+        """Return the ``value`` of every rank as a list, in the order of ranks.
 
         Raises:
             RankError: another rank ended.
@@ -155,7 +155,8 @@ class ProcessGroup:
         """Check that all ranks pass the same ``facts``.
 
         Raises:
-            RankError: names the rank and what differs; ``hint`` says what was expected.
+            RankError: the facts of a rank differ. The message names the rank and the difference, and ends with
+                ``hint``, a text about what was expected.
         """
         every = self.gather(dict(facts))
         for rank, other in enumerate(every):
@@ -167,7 +168,7 @@ class ProcessGroup:
     def in_turn(self) -> Iterator[None]:
         """Run the block on rank 0 first, then on the first rank of every other machine, then on all other ranks.
 
-        So only one rank writes a cache file, and later ranks find it. Raises RankError.
+        So only one rank writes a cache file, and later ranks find this file. Raises RankError.
         """
         turn = 0 if self.is_first else 1 if self.place.local_rank == 0 else 2
         for _ in range(turn):

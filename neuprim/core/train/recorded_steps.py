@@ -1,9 +1,10 @@
-"""Training steps as CUDA graphs: the launches of a step are recorded once and replayed, and the host does not wait.
+"""Training steps as CUDA graphs: a step's kernel launches are recorded once and replayed; the host does not wait.
 
 The arrays of a recorded step have fixed sizes (:class:`~neuprim.core.render.cuda.binning.FrameCapacity`). A step that
-does not fit them, or whose numbers are not finite, sets the flag "refused" on the device. Then this step and all
-replayed steps after it change nothing. The host reads the flag a few steps later. It takes these steps again without
-recordings, and uses larger arrays afterwards. So the results have the same bits as without recordings.
+does not fit into these arrays, or whose numbers are not finite, sets the flag "refused" on the GPU. Then this step and
+all replayed steps after it change no parameter. The host reads the flag a few steps later. The host then takes these
+steps again without recordings, and uses larger arrays afterwards. So the results have the same bits as without
+recordings.
 """
 
 from __future__ import annotations
@@ -47,15 +48,15 @@ _IN_FLIGHT = 16
 """Largest number of replayed steps whose results the host has not read yet."""
 
 _NUMBERS = 64
-"""Space for the numbers that a step sends to the device or back: at most so many for each view, besides its channels,
-and for the points."""
+"""Space in the host tensors for the numbers that a step sends to the GPU or receives from it. Each view has this space
+plus one number per channel; the points of a step have this space together."""
 
 _MOST_PROGRAMS = 16
 """Largest number of recordings that are kept. Each image size and each set of intrinsics needs its own recording."""
 
 _IDLE_STEPS = 128
-"""A recording gives way to a new one only after so many steps without use. If it were sooner, data with many kinds of
-images would record a step each time and replay none."""
+"""Number of steps without use after which a new recording may replace an old one. With a smaller number, data with many
+image sizes would record almost every step and replay none."""
 
 
 class RecordableTrainer(Protocol):
@@ -105,7 +106,7 @@ def recording_fault(trainer: RecordableTrainer) -> str | None:
 
 @dataclass
 class _Inputs:
-    """The views and points that a step uses. The tensors of a recorded step's inputs never change their memory."""
+    """The views and points that a step uses. In a recorded step, these tensors stay in the same memory."""
 
     views: list[tuple[View, Pixels]]
     samples: PointSamples | None
@@ -122,7 +123,7 @@ class _Inputs:
         return [x for x in found if x is not None]
 
     def shapes(self) -> tuple[Any, ...]:
-        """Return a key of what a recording depends on: intrinsics, shapes, and which of the optional tensors exist."""
+        """Return a key for the recordings: the cameras' intrinsics, the shapes, and which optional tensors exist."""
         found: list[Any] = [tuple(x.shape for x in self.tensors())]
         for view, pixels in self.views:
             camera = view.camera
@@ -141,9 +142,9 @@ class _Program:
     inputs: _Inputs
     given: Tensor  # float64: for each view its matrix and background; learning rates; scales of the points
     run: Callable[[], None] = lambda: None
-    used: int = 0  # last step that used it
-    found: Tensor | None = None  # float64: refused, then RenderedView.numbers of each view
-    parts: tuple[tuple[str, ...], ...] = ()  # of the loss of each view
+    used: int = 0  # last step that used the recording
+    found: Tensor | None = None  # float64: the flag "refused", then RenderedView.numbers of each view
+    parts: tuple[tuple[str, ...], ...] = ()  # names of the loss parts of each view
 
 
 class _Flight(NamedTuple):
@@ -155,7 +156,7 @@ class _Flight(NamedTuple):
     samples: PointSamples | None
     report: StepReport
     parts: tuple[tuple[str, ...], ...]
-    memory: tuple[Tensor, Tensor]  # of the host: numbers given, numbers found
+    memory: tuple[Tensor, Tensor]  # host tensors: numbers sent to the GPU, results
     event: Any
 
 
@@ -165,7 +166,7 @@ class StepRecorder:
     Attributes:
         capacity: sizes of a recorded step's arrays; None until a step without recording showed which sizes are needed.
         replayed: number of steps that were replayed.
-        repeated: number of replayed steps that were taken again because they, or an earlier step, were refused.
+        repeated: number of replayed steps that were taken again, because the step or an earlier one was refused.
     """
 
     def __init__(self, trainer: RecordableTrainer) -> None:
@@ -183,13 +184,19 @@ class StepRecorder:
     # ------------------------------------------------------------ what the trainer calls
 
     def reset(self) -> None:
-        """Discard all recordings, because tensors that they use were replaced; all results must have been read."""
+        """Discard all recordings, because tensors that they use were replaced.
+
+        The results of all replayed steps must have been read before (:meth:`settle`).
+        """
         assert not self._flights, "settle() comes first"
         self._programs.clear()
         self._seen.clear()
 
     def observe_counts(self, stats: RenderStats) -> None:
-        """Read the array sizes that an unrecorded frame needed; if they exceed the capacity, enlarge it and reset."""
+        """Read the array sizes that an unrecorded frame needed.
+
+        If a size exceeds :attr:`capacity`, enlarge the capacity and discard all recordings.
+        """
         from neuprim.core.render.cuda.backend import frame_counts
         from neuprim.core.render.cuda.binning import FrameCapacity
 
@@ -200,7 +207,7 @@ class StepRecorder:
         self.reset()
 
     def take(self, tasks: list[ViewTask], samples: PointSamples | None, progress: float) -> StepReport | None:
-        """Replay a step and return its report. If it has no recording, return None; the trainer must take the step.
+        """Replay a step and return its report; return None if the trainer must take the step without a recording.
 
         ``samples`` are points with known extinction, or None. ``progress`` is the used fraction of the training budget.
         """
@@ -242,9 +249,9 @@ class StepRecorder:
         return report
 
     def settle(self, keep: int = 0) -> list[_Flight]:
-        """Read the results of all replayed steps but the last ``keep``, and resolve their reports.
+        """Read the results of all replayed steps except the last ``keep``, and write them into the steps' reports.
 
-        If a step was refused, return it and all later steps, which the trainer must repeat; else return [].
+        If a step was refused, return this step and all later steps, which the trainer must repeat. Otherwise return [].
         """
         while len(self._flights) > keep:
             first = self._flights[0]
@@ -270,7 +277,7 @@ class StepRecorder:
         return []
 
     def _allocate(self) -> tuple[Tensor, Tensor]:
-        """Return two host tensors: for the numbers that a step sends to the device, and for its results."""
+        """Return two host tensors: one for the numbers that a step sends to the GPU, one for the step's results."""
         views, channels = self.trainer.settings.views_per_step, self.trainer.dataset.channels
         size = views * (_NUMBERS + channels) + len(self.trainer.current_model.specs) + _NUMBERS
         given, found = (torch.zeros(size, dtype=torch.float64, pin_memory=self._on_gpu) for _ in range(2))
@@ -279,7 +286,10 @@ class StepRecorder:
     # ------------------------------------------------------------ recording
 
     def _find_program(self, inputs: _Inputs) -> _Program | None:
-        """Return the recording for inputs of these shapes; None until the shapes occur twice and there is room."""
+        """Return the recording for inputs of these shapes.
+
+        Return None if the shapes occur for the first time, or if there are too many recordings in use.
+        """
         model, trainer, programs = self.trainer.current_model, self.trainer, self._programs
         stages = (model.density.stage, model.colour.stage, trainer.has_anisotropy_loss, trainer.limits_size)
         key = (stages, inputs.shapes())

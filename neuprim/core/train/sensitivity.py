@@ -1,10 +1,10 @@
 """Estimate the error in images, or at points, of removing a primitive or a part of one, by one backward pass per view.
 
-A part (a prunable unit) is a group of parameters such as a neuron. To first order an image changes by J delta when
-parameters change by delta; J is its Jacobian. For random signs z per pixel and channel, the mean of (z . J delta)^2 is
-|J delta|^2 (Hutchinson 1990). A backward pass computes z . J. Removing a primitive changes a pixel by w times the
-difference of its colour from the colour behind it, where w = alpha T is the primitive's weight in the pixel. The sum of
-w^2 over pixels predicts the loss better than the sum of w.
+A part (a prunable unit) is a group of parameters such as a neuron. If parameters change by delta, an image changes by J
+delta to first order, where J is the Jacobian of the image. For random signs z per pixel and channel, the mean of (z . J
+delta)^2 is |J delta|^2 (Hutchinson 1990). A backward pass computes z . J. Removing a primitive changes a pixel by w x
+(the primitive's colour - the colour behind the primitive), where w = alpha T is the primitive's weight in the pixel.
+The sum of w^2 over pixels predicts the increase of the loss better than the sum of w.
 """
 
 from __future__ import annotations
@@ -29,12 +29,13 @@ class Sensitivity:
     """Mean squared effects of changes to a model, over the pixels and channels of some views, or over points.
 
     Attributes:
-        whole: (N,) effect of removing each primitive; for views, its colour is taken to differ by 1 from what is
-            behind.
-        seen: (N,) number of views, or frames, that show the primitive; where it is 0, the effects are unknown.
+        whole: (N,) effect of removing each primitive. For views, the primitive's colour is assumed to differ by 1 from
+            the colour behind the primitive.
+        seen: (N,) number of views, or frames, that show the primitive. If the number is 0, the effects are unknown.
         pieces: name of a prunable unit, e.g. of a neuron -> (N,) effect of setting this unit of each primitive to zero.
-        columns: parameter -> (C,) float64 effect of changing each of its C numbers in all primitives, by independent
-            random amounts of variance 1. A change of "quats" is perpendicular to the quaternion, which has unit norm.
+        columns: parameter -> (C,) float64 effects. Effect c is that of changing number c of the parameter in all
+            primitives, by independent random amounts of variance 1. A change of "quats" is perpendicular to the
+            quaternion, which has unit norm.
     """
 
     whole: Tensor
@@ -58,7 +59,7 @@ class _SensitivitySums:
         self.columns = {spec.name: torch.zeros(spec.size, dtype=torch.float64) for spec in model.specs}
 
     def add_pass(self, params: dict[str, Tensor]) -> None:
-        """Add the squared effects that follow from one backward pass: from ``params`` and their ``.grad``."""
+        """Add the squared effects of one backward pass, computed from ``params`` and their ``.grad``."""
         gradients = {
             name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in params.items()
         }
@@ -107,7 +108,8 @@ def sensitivity(
 def inner_sensitivity(model: Primitives, draws: Sequence[PointSamples], seed: int = 0, threads: int = 0) -> Sensitivity:
     """Estimate the effects of changes to a model on its extinction at points, relative to typical extinction.
 
-    Returns CPU tensors. It is meant for volumes with known extinction, because images do not show these effects.
+    Returns CPU tensors. Use this function for volumes with known extinction, because images do not show the extinction
+    inside dense matter.
 
     Args:
         draws: samples of points, each from one frame.

@@ -1,7 +1,8 @@
 """Settings of a run under ``model`` and ``train``, and checks that tasks and losses declare which settings they read.
 
 The settings in :data:`OPTIONAL` are read only by the ``build`` function of a task or by a loss. A task or loss lists in
-``uses`` those that it reads, and gets no others of them. It is an error to set one that neither of the two lists.
+``uses`` the optional settings that it reads, and gets only these. If the user sets an optional setting that neither the
+task nor the loss lists, this is an error.
 """
 
 from __future__ import annotations
@@ -30,19 +31,21 @@ class ModelSettings:
     """Settings of the model: number of primitives, density and colour.
 
     Attributes:
-        primitives: number of primitives. "auto" chooses it from the budget: ``auto_primitives`` times the square root
-            of the number of steps, or of the steps that a short test of the pace expects in ``train.max_seconds``; a
-            run stores the number.
+        primitives: number of primitives. "auto" chooses ``auto_primitives`` times the square root of the number of
+            steps. With ``train.max_seconds``, a short trial training estimates how many steps fit in this time. A run
+            stores the chosen number.
         auto_primitives: the factor of ``primitives=auto``.
-        density: settings of the density that the task builds; the presets of a task show what there is.
-        colour: settings of the colour that the task builds; the presets of a task show what there is.
-        neurons: hidden width K of the cosine density, 0 to 16; 0 is a constant density. A Gaussian density has none.
+        density: settings of the density that the task builds; the presets of a task show the settings that exist.
+        colour: settings of the colour that the task builds; the presets of a task show the settings that exist.
+        neurons: number of neurons K of the cosine density, 0 to 16; 0 is a constant density. A Gaussian density has no
+            neurons.
         sh_degree: degree of the spherical harmonics of the colour, 0 to 3.
-        sh_every: fraction of the budget after which one more band of spherical harmonics is trained; 0 trains all from
-            the start.
-        init: settings of the starting values of the fields; the presets of a task show what there is.
-        reduced: reductions of density and colour, one after the other, as ``density.neurons=0`` and
-            ``colour.degree=1``; ``neuprim prune`` writes those that a scene permits.
+        sh_every: fraction of the budget after which one more band of spherical harmonics is trained; 0 trains all
+            bands from the start.
+        init: settings of the starting values of the density and colour; the presets of a task show the settings that
+            exist.
+        reduced: reductions of the density and colour to simpler forms, applied in this order, such as
+            ``density.neurons=0`` and ``colour.degree=1``. ``neuprim prune`` writes the reductions that a scene permits.
     """
 
     primitives: Annotated[int, Range(at_least=1)] | Literal["auto"] = 2000
@@ -65,7 +68,7 @@ class ModelSettings:
         """Number of primitives, as an integer.
 
         Raises:
-            ConfigError: ``primitives`` is "auto"; the number is only chosen when a training starts.
+            ConfigError: ``primitives`` is "auto", because only the start of a training chooses the number.
         """
         if self.primitives == "auto":
             raise ConfigError(
@@ -79,7 +82,7 @@ class ModelSettings:
         If both steps and seconds are limited, the smaller number is taken.
 
         Args:
-            pace: measured seconds per step, divided by the number of primitives. With None, "auto" stays if
+            pace: measured seconds per step, divided by the number of primitives. Without it, "auto" stays "auto" if
                 ``train.max_seconds`` is set.
         """
         if self.primitives != "auto" or (pace is None and train.max_seconds is not None):
@@ -95,19 +98,19 @@ class PopulationSettings:
     """How primitives are added, moved and removed during a training (population control).
 
     Attributes:
-        strategy: "fixed", "relocate" (move the least used primitives to where the error is largest; the number is
-            constant once it is reached) or "gradient" (clone, split and prune by the norm of the density gradient, as
-            the authors of the method do).
-        every: steps between two interventions.
+        strategy: "fixed" (no change), "relocate" (move the least used primitives to where the error is largest; their
+            number is constant after it has reached ``grow_to``) or "gradient" (clone, split and prune by the norm of
+            the density gradient, as the authors of the method do).
+        every: steps between two interventions (changes of the primitives).
         start: fraction of the budget at which interventions begin.
         stop: fraction of the budget at which interventions end.
         fraction: relocate: largest share of primitives moved at once.
         idle: relocate: move only primitives whose weight in the images since the last intervention is below this share
-            of the mean weight; null moves the least used ones, whatever their weight.
-        grow_to: relocate: number of primitives to reach; where the start has fewer, those with the largest error split.
-            null is ``model.primitives``, for which the data may not offer enough starting points.
-        grow_from: relocate: share of ``model.primitives`` at the start; the others are added where the error is
-            largest. 1 starts with all that the data offer points for.
+            of the mean weight. null moves the primitives with the least weight, whatever the weight is.
+        grow_to: relocate: number of primitives to reach. If the training starts with fewer, the primitives with the
+            largest error split. null means ``model.primitives``.
+        grow_from: relocate: share of ``model.primitives`` at the start; the other primitives are added where the error
+            is largest. 1 starts with all primitives, or with fewer if the data offer fewer starting points.
         grow_threshold: gradient: mean norm of the density gradient from which primitives are cloned or split.
         prune_threshold: gradient: mean norm of the density gradient below which primitives are removed.
         clone_scale: gradient: largest size of a primitive that is cloned, in units of the scene's extent.
@@ -147,42 +150,46 @@ class TrainSettings:
 
     Attributes:
         iterations: number of steps, each of ``views_per_step`` views; null leaves the budget to ``max_seconds``. A
-            command line with ``max_seconds`` alone sets it to null, so that all the seconds are used.
-        views_per_step: views of a step; gradients are their mean. Several small images use a GPU better than one.
-        stride: a step renders every stride-th pixel of a view in x and y, from a random first one; 1 renders whole
-            views. "auto" balances the time of pixels and of primitives, and is finer towards the end.
-        angular_size: upper bound of a primitive's largest semi-axis over its distance to the nearest training camera;
-            null for none.
-        exposure_rate: learning rate of a gain per training view and channel, per step that uses the view, for
-            photographs with different exposures; 0 for none. Held-out views are rendered with the mean gain.
+            command line with ``max_seconds`` alone sets ``iterations`` to null, so that all the seconds are used.
+        views_per_step: number of views that a step renders. The gradient of a step is the mean over its views. Several
+            small images use a GPU better than a single one.
+        stride: a step renders every stride-th pixel of a view in x and y, from a random first pixel; 1 renders whole
+            views. "auto" chooses the stride so that the pixels and the primitives take equal time, and lowers the
+            stride towards the end.
+        angular_size: upper bound of the ratio of a primitive's largest semi-axis to its distance from the nearest
+            training camera; null for no bound.
+        exposure_rate: learning rate of the exposure: a factor per training view and colour channel, updated in the
+            steps that use the view. Set this for photographs with different exposures; 0 learns no exposures. Held-out
+            views are rendered with the mean exposure.
         max_seconds: budget of training time in seconds; null for none. Such a run is not bit-reproducible.
-        rates: learning rates by parameter name, which replace those of the fields.
-        rate_units: unit of a parameter's learning rate, by its name, over the field's own: "absolute" (of positions:
-            scene units per step), "extent" (times the scene's extent, so that it does not depend on the scale) or
-            "pixel" (times the size of a pixel at the median depth of the starting points, at most 1/250 of the extent:
-            sharper images need smaller steps).
-        final_rate: learning rates decay exponentially to this fraction of themselves; 1 keeps them constant.
-        cooldown: last share of the budget, in which learning rates also fall linearly to almost nothing; 0 for none.
+        rates: learning rates by parameter name, which replace the default rates of the density and colour fields.
+        rate_units: parameter name -> unit of its learning rate, which replaces the default unit. "absolute" uses the
+            rate as it is (for positions: scene units per step). "extent" multiplies the rate by the scene's extent, so
+            that the rate does not depend on the scale. "pixel" multiplies the rate by the size of a pixel at the median
+            depth of the starting points (at most 1/250 of the extent), because sharper images need smaller steps.
+        final_rate: learning rates decay exponentially to this fraction of their initial values; 1 keeps them constant.
+        cooldown: last share of the budget, in which learning rates also fall linearly to 2 %; 0 for no cool-down.
         adam_beta2: decay of Adam's second moment per step, at least 0 and below 1.
         warmup_steps: steps in which learning rates rise linearly from zero.
-        supervision: what is compared: "images", "voxels" (points of the volume files that the images were rendered
-            from, where the data set has them), "both", or "auto" (both where the data set has voxels, else images).
-        voxels_per_step: points in a step, all of one frame.
-        voxels_every: both: steps from one use of points to the next; every step has an image.
-        voxel_weight: both: weight of the points' loss, relative to that of the images.
-        voxel_colour: weight of the source radiance at the points, relative to their extinction; 0 leaves colours to the
-            images.
-        loss: name of a loss that a package provides (``neuprim tasks`` lists them); null for the task's own.
+        supervision: what the model is compared with: "images", "voxels" (points in the volume files from which the
+            images were rendered), "both", or "auto" ("both" if the data set has volume files, else "images").
+        voxels_per_step: number of points in a step, all from one frame.
+        voxels_every: with supervision=both: every ``voxels_every``-th step uses points; all steps use images.
+        voxel_weight: with supervision=both: weight of the loss of the points, relative to the loss of the images.
+        voxel_colour: weight of the source radiance at the points, relative to the extinction; 0 trains colours only by
+            the images.
+        loss: name of a loss that a package provides (``neuprim tasks`` lists the names); null for the task's own loss.
         ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
-        size_weight: weight of the mean semi-axis over the scene's extent. Smaller primitives overlap less: steps are
-            faster, and primitives that no view needs vanish (3DGS-MCMC, Kheradmand et al. 2024).
-        anisotropy_weight: weight of mean(std over axes of s / min s).
-        anisotropy_from: step at which the anisotropy weight begins.
+        size_weight: weight of a regulariser in the loss, the mean semi-axis divided by the scene's extent. Smaller
+            primitives overlap less, so steps are faster; primitives that no view needs vanish (3DGS-MCMC, Kheradmand et
+            al. 2024).
+        anisotropy_weight: weight of a second regulariser, the mean over primitives of std(s / min s), where s are the
+            three semi-axes.
+        anisotropy_from: step at which the anisotropy regulariser begins.
         background: "white", "black", "random" or "auto" (the choice of the data set).
         checkpoint_every_seconds: seconds between two checkpoints; the end of the training writes one too.
         log_every: steps between two lines of metrics.jsonl.
-        eval_every: fraction of the budget between two points of the curve, measured on a few held-out views; 0 for
-            none.
+        eval_every: fraction of the budget between two measurements of the PSNR on a few held-out views; 0 for none.
     """
 
     iterations: Annotated[int, Range(at_least=0)] | None = 30_000
@@ -241,12 +248,12 @@ OPTIONAL = ("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_we
 class TrackedMapping(dict[str, Any]):
     """Mapping of settings that is passed to a function of a plugin (a task or a loss).
 
-    Reading a setting that the plugin did not declare is a ConfigError.
+    If the function reads a setting that the plugin did not declare, the mapping raises ConfigError.
 
     Args:
         owner: the plugin, for messages, e.g. ``"task 'glow'"``.
         group: dotted name of the group of settings, e.g. ``"model"``.
-        member: attribute of the plugin that declares what it reads, "uses" or "options".
+        member: attribute of the plugin that declares the settings it reads, "uses" or "options".
     """
 
     def __init__(self, values: Mapping[str, Any], owner: str, group: str, member: str) -> None:
@@ -262,7 +269,7 @@ class TrackedMapping(dict[str, Any]):
 
 
 def build_settings(task: TaskSpec, model: ModelSettings, options: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the mapping that a task's ``build`` and ``check`` get: model settings that it uses, and "options".
+    """Return the mapping for a task's ``build`` and ``check``: model settings that the task uses, and "options".
 
     Args:
         options: the task's own options by name; missing ones take their defaults, unknown ones are ignored.
@@ -273,7 +280,10 @@ def build_settings(task: TaskSpec, model: ModelSettings, options: Mapping[str, A
 def loss_settings(
     owner: TaskSpec | LossExtension, train: TrainSettings, options: Mapping[str, Any]
 ) -> Mapping[str, Any]:
-    """Return the mapping that a loss of ``owner`` (a task or a loss) gets: settings that it uses, and "options"."""
+    """Return the mapping for the loss of ``owner``: the settings under ``train`` that ``owner`` uses, and "options".
+
+    ``owner`` is the task or loss plugin that declares what it uses.
+    """
     who = f"the loss of task {owner.name!r}" if hasattr(owner, "build") else f"loss {owner.name!r}"
     return _track_used_settings("train", vars(train), owner, options, who)
 

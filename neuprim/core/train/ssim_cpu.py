@@ -1,10 +1,11 @@
 """L1 + SSIM loss of two images x and y, and its analytic gradient with respect to x, on all CPU cores.
 
-SSIM uses an 11 x 11 Gaussian window (sigma 1.5), as two blurs of 11 taps, and only windows inside the image. With the
-window means a = E[x] and b = E[y], SSIM is AB/(CD). A = 2ab + c1, B = 2(E[xy] - ab) + c2, C = a^2 + b^2 + c1 and D =
-E[xx] - a^2 + E[yy] - b^2 + c2, with c1 = 0.01^2 and c2 = 0.03^2. The adjoint of the blur turns SSIM's derivatives by
-E[x], E[xx] and E[xy] into a gradient per pixel. Where both images are equal, as in an empty background, SSIM is 1 and
-the gradient 0. So columns at the left and right that are equal in all rows of a window are skipped.
+SSIM uses an 11 x 11 Gaussian window (sigma 1.5), computed as two blurs of 11 taps. Only windows inside the image count.
+With the window means a = E[x] and b = E[y], SSIM is AB/(CD). A = 2ab + c1, B = 2(E[xy] - ab) + c2, C = a^2 + b^2 + c1
+and D = E[xx] - a^2 + E[yy] - b^2 + c2, with c1 = 0.01^2 and c2 = 0.03^2. The adjoint of the blur turns SSIM's
+derivatives with respect to E[x], E[xx] and E[xy] into a gradient per pixel. Where both images are equal, as in an empty
+background, SSIM is 1 and the gradient 0. So the kernels skip columns at the left and right if both images are equal
+there in all rows of a window.
 """
 
 from __future__ import annotations
@@ -78,10 +79,10 @@ def _blur_loss_rows(out, V, step, count):  # type: ignore[no-untyped-def]
 
 @inline
 def _ssim_loss_derivatives(s, n, scale):  # type: ignore[no-untyped-def]
-    """Replace window means by the derivatives of scale x SSIM with respect to them; return the sum of SSIM.
+    """Replace window means by the derivatives of scale x SSIM with respect to the means; return the sum of SSIM.
 
-    ``s`` has five blocks: E[x], E[y], E[xx], E[yy] and E[xy]. The first ``n`` numbers of each are used. Those of E[x],
-    E[xx] and E[xy] are replaced.
+    ``s`` has five blocks: E[x], E[y], E[xx], E[yy] and E[xy]. The function uses the first ``n`` numbers of each block,
+    and replaces the numbers of E[x], E[xx] and E[xy].
     """
     total = f(0)
     for j in range(n):
@@ -103,8 +104,8 @@ def _ssim_loss_derivatives(s, n, scale):  # type: ignore[no-untyped-def]
 def _find_unequal_columns(start, stop, x, y, height, unequal):  # type: ignore[no-untyped-def]
     """Set unequal[i], for image rows i in start:stop, to the column range [first, end) where images differ.
 
-    ``x`` and ``y`` are flat images with ``height`` rows; a column is one channel of one pixel. Equal rows get first >
-    end.
+    ``x`` and ``y`` are flat images with ``height`` rows; a column is one channel of one pixel. A row that is equal in
+    both images gets first > end.
     """
     n = x.shape[0] // height
     for i in range(start, stop):
@@ -120,9 +121,9 @@ def _find_unequal_columns(start, stop, x, y, height, unequal):  # type: ignore[n
 def _widest_columns(unequal, start, stop, before, after, most):  # type: ignore[no-untyped-def]
     """Return one range [first, end) of columns that contains all differences of the two images in rows start:stop.
 
-    ``unequal`` has the range of each row, from :func:`_find_unequal_columns`. The result begins ``before`` columns
-    earlier and ends ``after`` columns later, within [0, most). If nothing differs, it is empty (end is first); for
-    images narrower than 20 pixels, it may not be.
+    ``unequal`` has the range of each row, from :func:`_find_unequal_columns`. The returned range begins ``before``
+    columns earlier and ends ``after`` columns later, within [0, most). If nothing differs, the range is empty (end is
+    first); in images narrower than 20 pixels, it may contain columns.
     """
     first, end = most, np.int64(0)
     for i in range(start, stop):
@@ -136,8 +137,8 @@ def _ssim_loss_maps(start, stop, x, y, height, channels, unequal, maps):  # type
     """Write derivatives of the mean SSIM for window rows start:stop; return the sum of SSIM over these rows.
 
     ``x`` and ``y`` are flat images of (height, width, channels). ``unequal`` comes from :func:`_find_unequal_columns`.
-    The planes of ``maps`` get the derivatives with respect to E[x], E[xx] and E[xy]. There is one
-    per window, and 10 zeros on every side of the plane.
+    The three planes of ``maps`` get the derivatives with respect to E[x], E[xx] and E[xy]. A plane has one derivative
+    per window and channel, and a border of zeros, 10 windows wide, on every side.
     """
     n = x.shape[0] // height
     reach = (SSIM_TAPS - 1) * channels
@@ -169,8 +170,8 @@ def _ssim_loss_maps(start, stop, x, y, height, channels, unequal, maps):  # type
 def _loss_gradient(gr, x, y, s, n, l1_share, weight):  # type: ignore[no-untyped-def]
     """Write the gradient of the loss with respect to ``x`` into ``gr``, for ``n`` numbers; return the sum of |x - y|.
 
-    ``s`` has the three derivative maps of SSIM after the adjoint blur, in blocks. ``l1_share`` is the L1 gradient of a
-    number where x > y, ``weight`` the weight of SSIM.
+    ``s`` has the three derivative maps of SSIM after the adjoint blur, one block per map. ``l1_share`` is the gradient
+    of the L1 loss where x > y, ``weight`` the weight of SSIM in the loss.
     """
     line = f(0)
     for j in range(n):

@@ -41,9 +41,10 @@ class StepReport:
 
     @classmethod
     def pending(cls, settle: Callable[[], None], **known: Any) -> StepReport:
-        """Return a report whose loss, parts and PSNR are not known yet. ``known`` has other fields.
+        """Return a report whose loss, parts and PSNR are not known yet; ``known`` has values of other fields.
 
-        The first access to one of these three calls ``settle``, which must pass them to :meth:`resolve`.
+        The first access to the loss, the parts or the PSNR calls ``settle``, which must pass all three to
+        :meth:`resolve`.
         """
         report = cls.__new__(cls)
         report.__dict__.update(known, _settle=settle)
@@ -73,10 +74,10 @@ class ViewResult(NamedTuple):
     """Results of one view of a step.
 
     Attributes:
-        loss: the view's part of the step's loss. For the last view, it includes points and regularisers.
-        parts: named parts of the loss. For the last view, they include points.
-        gain: gradient of the logarithm of the view's exposure, one number per channel; None if none are learned.
-        correction: gradient of the view's corrections; None if none are learned.
+        loss: the view's part of the step's loss. The loss of the last view includes points and regularisers.
+        parts: named parts of the loss. The parts of the last view include points.
+        gain: gradient of the logarithm of the view's exposure, one number per channel; None without learned exposures.
+        correction: gradient of the view's corrections; None without learned corrections.
     """
 
     view: int
@@ -95,13 +96,16 @@ class RenderedView:
     loss: Tensor
     parts: dict[str, float | Tensor]
     squared: Tensor  # sum of squared errors
-    counted: int | Tensor  # numbers that count
+    counted: int | Tensor  # number of values in the sum: unmasked pixels x channels
     name: str
     truth: Tensor
     contributions: Contributions
 
     def numbers(self, cost: Tensor, more: Iterable[Tensor] = ()) -> Tensor:
-        """Return ``cost``, ``squared``, ``counted``, parts and ``more`` in one float64 tensor: one wait for the GPU."""
+        """Return ``cost``, ``squared``, ``counted``, parts and ``more`` in one float64 tensor.
+
+        With a single tensor, the host waits for the GPU only once.
+        """
         values = (cost.detach(), self.squared, self.counted, *self.parts.values(), *more)
         like = self.squared
         return torch.stack(
@@ -115,7 +119,10 @@ class RenderedView:
 def compare_view(
     output: RenderOutput, loss: Loss, view: View, pixels: Pixels, background: Tensor, progress: float = 0.0
 ) -> RenderedView:
-    """Compare a rendered view with its image, composited over the same (C,) ``background``; does not wait for a GPU."""
+    """Return the loss of a rendered view against the view's true image, without waiting for a GPU.
+
+    The true image is composited over the (C,) ``background`` of the rendered view.
+    """
     truth = pixels.over(background)
     rgb = output.rgb if pixels.mask is None else torch.where(pixels.mask[..., None], output.rgb, truth)
     value, parts = loss(rgb, truth, Supervision(view, pixels.mask, pixels.alpha, progress))

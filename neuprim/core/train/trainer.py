@@ -1,9 +1,9 @@
 """The training loop of every task.
 
-A step draws a view, renders it, compares it with its image, runs the backward pass, updates the parameters and applies
-population control. ``train.supervision`` can add points of known extinction to the view, or use points alone.
-:meth:`Trainer.state` has everything that affects the next step, so a resumed run gives the same bits as an
-uninterrupted one.
+A step draws a training view, renders the view, compares the result with the view's image, runs the backward pass,
+updates the parameters and applies population control. ``train.supervision`` can add points of known extinction to the
+view, or use points alone. :meth:`Trainer.state` returns everything that affects the next step, so a resumed run gives
+the same bits as an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -64,20 +64,20 @@ __all__ = ["StepReport", "Trainer"]
 class Trainer:
     """Trains a model on the training views of a data set.
 
-    The model's tensors move to the device that the render settings choose. Random numbers are drawn on the CPU, so all
-    devices use the same ones.
+    The model's tensors move to the device that the render settings choose. Random numbers are drawn on the CPU, so they
+    are the same on all devices.
 
     Attributes:
         extent: extent of the scene, in scene units; unit of "extent" learning rates and of size limits.
         pixel: size of a pixel at the median depth of the scene, in scene units; unit of "pixel" learning rates.
         step: number of finished steps.
         elapsed: seconds of training, without held-out evaluations and file writes.
-        fake_quantize: differentiable function that rounds parameters as a file would store them; None for none.
+        fake_quantize: differentiable function that rounds parameters as a file would store them; None: no rounding.
         zero_masks: parameter -> (N, ...) bool, True for values that training keeps at zero.
         rank: rank of this process among all processes that train the model.
         ranks: number of processes that train the model.
         stop_requested: function called after every step; True ends the training, see :attr:`stopping`.
-        recorder: replays steps as CUDA graphs, see :meth:`settle`; None where steps cannot be recorded.
+        recorder: replays steps as CUDA graphs, see :meth:`settle`; None if steps cannot be recorded.
     """
 
     rank, ranks = 0, 1
@@ -126,13 +126,13 @@ class Trainer:
 
     @property
     def model(self) -> Primitives:
-        """The model after the last step. Reading it waits for all steps that a GPU has not finished."""
+        """The model after the last step. Reading this property waits for all steps that a GPU has not finished."""
         self.settle()
         return self.current_model
 
     @property
     def progress(self) -> float:
-        """Used fraction of the budget, 0 to 1: of steps or of seconds, whichever is larger. Schedules depend on it."""
+        """Used fraction of the budget, 0 to 1, of steps or seconds: the larger one. Schedules depend on this value."""
         steps = self.settings.iterations
         done = 0.0 if steps is None else self.step / steps if steps else 1.0
         if self.settings.max_seconds is not None:
@@ -159,7 +159,7 @@ class Trainer:
     # ------------------------------------------------------------ the loop
 
     def run(self) -> Iterator[StepReport]:
-        """Run steps until the budget is used, yielding each result; then the caller may save the state or stop."""
+        """Run steps until the budget is used. Yield the result of each step; the caller may then save or stop."""
         while not self.finished:
             yield self.train_step()
 
@@ -205,7 +205,7 @@ class Trainer:
     def _take_step(
         self, report: StepReport, tasks: list[ViewTask], samples: PointSamples | None, progress: float, start: float
     ) -> None:
-        """Take a step without CUDA graph or population control, from views ``tasks`` and ``samples`` of points."""
+        """Take one step on the views ``tasks`` and the points ``samples``, without CUDA graph or population control."""
         model = self.current_model
         for value in model.params.values():
             value.grad = None
@@ -249,9 +249,9 @@ class Trainer:
         report.resolve(cost, parts, psnr)
 
     def settle(self, keep: int = 0) -> None:
-        """Wait for all replayed steps except the last ``keep``, and repeat those that the GPU refused.
+        """Wait for all replayed steps except the last ``keep``, and repeat the steps that the GPU refused.
 
-        It refuses steps that need larger arrays or are not finite. Raises the errors of :meth:`train_step`.
+        The GPU refuses steps that need larger arrays or are not finite. Raises the errors of :meth:`train_step`.
         """
         if self.recorder is None:
             return
@@ -289,7 +289,7 @@ class Trainer:
         return [ViewTask(*view, then) for view, then in zip(drawn, upcoming, strict=True)]
 
     def _exchange_gradients(self, contributions: Contributions) -> Contributions:
-        """Return ``contributions``; called after each view's backward pass. ``.grad`` already sums over views."""
+        """Return ``contributions`` after a view's backward pass, unchanged: ``.grad`` already sums over views."""
         return contributions
 
     def _combine_views(
@@ -326,7 +326,7 @@ class Trainer:
         return torch.full((channels,), 1.0 if choice == "white" else 0.0)
 
     def _draw_points(self) -> PointSamples | None:
-        """Draw the points with known extinction for this step; None if the step uses none.
+        """Draw the points with known extinction for this step; return None if the step uses no points.
 
         With ``train.supervision=both``, steps whose number (from 1) is a multiple of ``voxels_every`` use points.
         """
@@ -379,7 +379,7 @@ class Trainer:
         return self.max_screen_size is not None and self.max_screen_size.due(self.step)
 
     def total_loss(self, loss: Tensor | None, points: PointLossResult | None = None) -> Tensor:
-        """Return the sum of a view's ``loss``, the loss of ``points`` (None: not in this step) and the regularisers."""
+        """Return the sum of a view's ``loss``, the loss of ``points`` (unless None) and the regularisers."""
         if points is not None:
             loss = points.loss if loss is None else loss + self.settings.voxel_weight * points.loss
         assert loss is not None
@@ -391,9 +391,10 @@ class Trainer:
         return loss
 
     def limit_model(self, sizes: bool, when: Tensor | None = None) -> None:
-        """Limit extinction to the largest of the data and, with ``sizes``, the sizes of primitives seen from cameras.
+        """Limit the extinction to the largest extinction of the data and, if ``sizes``, the sizes of primitives.
 
-        ``when`` is (1,) bool on the device; if it is False, nothing changes.
+        The limit of a size depends on the nearest camera (``train.angular_size``). ``when`` is (1,) bool on the device;
+        if ``when`` is False, the model does not change.
         """
         model = self.current_model
         if self.dataset.largest is not None:
@@ -404,7 +405,7 @@ class Trainer:
     def _backward(
         self, loss: Tensor, view: RenderedView | None, points: PointLossResult | None
     ) -> tuple[float, dict[str, float], float]:
-        """Run the backward pass, which adds to ``.grad`` of the parameters; return (loss, its named parts, PSNR).
+        """Run the backward pass, which adds to the parameters' ``.grad``; return (loss, parts by name, PSNR).
 
         The PSNR is that of ``view``, or of the extinction at ``points`` if ``view`` is None.
 
@@ -448,7 +449,7 @@ class Trainer:
     # ------------------------------------------------------------ exact state
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Return the training state, CPU tensors and JSON values, from which :meth:`load_state` continues exactly."""
+        """Return the training state as CPU tensors and JSON values; :meth:`load_state` continues exactly from it."""
         tensors = {f"params.{k}": v.detach() for k, v in self.model.params.items()}
         tensors |= {f"adam.{k}": v for k, v in self.optimizer.state().items()}
         tensors |= {f"population.{k}": v for k, v in self.population.state().items()}
@@ -465,8 +466,7 @@ class Trainer:
         """Restore the result of :meth:`state`, on any device.
 
         Raises:
-            CheckpointError: the state belongs to other settings or data; names the difference. The trainer is
-                unchanged.
+            CheckpointError: the state belongs to other settings or data. The trainer is unchanged.
         """
         check_state(tensors, header, where, *self.state())
         moved = {name: value.to(self.device, copy=True) for name, value in tensors.items()}

@@ -16,12 +16,12 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.settings import TrainSettings
 
 _FIXED = ("params", "adam", "exposure", "correction")
-"""Groups of state tensors, e.g. "adam" of "adam.age". All states with the same settings have the same tensors in a
-group."""
+"""Groups of state tensors; the tensor "adam.age" belongs to the group "adam". All states with the same settings have
+the same tensors in each of these groups."""
 
 
 def select_state_tensors(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Return the tensors whose names begin with ``prefix``; the returned names lack the prefix."""
+    """Return the tensors whose names begin with ``prefix``, by their names without the prefix."""
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
@@ -44,7 +44,7 @@ def check_state(
     """
     step, elapsed, views = (header.get(name) for name in ("step", "elapsed", "views"))
     if not isinstance(step, int) or not isinstance(elapsed, (int, float)) or step < 0 or not math.isfinite(elapsed):
-        raise CheckpointError(f"{where}: step {step!r}, elapsed {elapsed!r}; expected numbers")
+        raise CheckpointError(f"{where}: step is {step!r} and elapsed is {elapsed!r}; expected numbers of at least 0")
     if views != own_header["views"]:
         raise CheckpointError(
             f"{where}: trained on {views} views, but the data set now has {own_header['views']}; "
@@ -52,7 +52,7 @@ def check_state(
         )
     if header.get("names") != own_header["names"]:
         raise CheckpointError(
-            f"{where}: trained on {views} views, whose names the data set has changed; continue with the original views"
+            f"{where}: trained on {views} views, which now have other names; continue with the original views"
         )
     fault = _find_state_fault(tensors, own_tensors, step, own_header["views"])
     if fault is not None:
@@ -95,7 +95,10 @@ def _find_state_fault(tensors: Mapping[str, Tensor], own: Mapping[str, Tensor], 
 
 
 def check_training_settings(settings: TrainSettings, model: Primitives, dataset: Dataset) -> TrainSettings:
-    """Check settings against model and data; return them with ``supervision`` "auto" replaced by its meaning."""
+    """Check that settings fit the model and the data; return them with ``supervision="auto"`` resolved.
+
+    "auto" becomes "both" if the data set has points with known extinction, else "images".
+    """
     if len(dataset.train) == 0:
         raise DataError(f"{dataset.name}: the training split is empty")
     names = [spec.name for spec in model.specs]

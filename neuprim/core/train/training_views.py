@@ -27,14 +27,15 @@ _MIN_SIDE = 11
 """Smallest width and height in pixels of a view after a stride selected its pixels: the size of the SSIM window."""
 
 _PIXELS_PER_PRIMITIVE = 1.5
-"""Number of covered pixels (alpha above 0) that take as long as one primitive, in a training step on the CPU."""
+"""Number of covered pixels (alpha above 0) that a training step on the CPU computes in the time of one primitive."""
 
 GPU_LAUNCHES = 70_000
-"""Time of the kernel launches of a training step on a GPU, as the number of primitives that take as long. Smaller views
-do not shorten this time."""
+"""Number of primitives that a GPU computes in the time that the kernel launches of one training step take. Smaller
+views do not shorten the time of the launches."""
 
 _COUNTED_VIEWS = 16
-"""Largest number of training views whose covered pixels are counted; they are spread evenly over the training set."""
+"""Largest number of training views whose covered pixels are counted. These views are spread evenly over all training
+views."""
 
 _STRIDE_STAGES = ((0.7, 1), (0.9, 2))
 """Stages of the automatic stride: (used fraction of the budget at which the stage ends, divisor of the stride). After
@@ -43,20 +44,20 @@ the last stage, whole views are rendered."""
 _BETA1, _BETA2, _EPS = 0.9, 0.99, 1e-8
 
 _CORRECTION_RATES: dict[Correction, list[float]] = {"pose": [4e-3] * 6, "offset": [5e-3] * 3, "factor": [5e-3]}
-"""Kind of correction -> initial learning rate of each of its numbers, per step that uses the view. The six numbers of a
-pose are a rotation vector in radians and a shift in the ``unit`` of :class:`ViewCorrections`."""
+"""Kind of correction -> initial learning rates of the numbers of a correction, per step that uses the view. The six
+numbers of a pose are a rotation vector in radians and a shift in the ``unit`` of :class:`ViewCorrections`."""
 
 _CORRECTION_START, _CORRECTION_FINAL = 0.1, 0.02
 """Used fraction of the budget at which corrections of views begin, and their last learning rate as a fraction of the
-first. Before that, the model is too blurred to determine corrections."""
+first learning rate. Corrections do not begin earlier, because the model is too blurred to determine them."""
 
 
 class PixelLoader:
     """Loads the pixels of training views, for a model on the device ``where``.
 
-    For a GPU, a thread loads the next view in advance; this does not change the order of the views. Views are cached in
-    up to a quarter of the free GPU memory, as loading a large view again takes longer than a step. Stored images are
-    cached before their conversion to floats, most of them in 8 bits.
+    For a GPU, a thread loads the next view in advance; this does not change the order of the views. Up to a quarter of
+    the free GPU memory caches views, because loading a large view again takes longer than a training step. Images from
+    files are cached before their conversion to floats; most have 8 bits per value.
     """
 
     def __init__(self, dataset: Dataset, where: torch.device) -> None:
@@ -125,9 +126,10 @@ def count_covered_pixels(views: ViewSet) -> float:
 def choose_stride(stride: int | Literal["auto"], covered: float, primitives: int, progress: float) -> int:
     """Return the stride of the pixels to render at ``progress``, the used fraction of the budget.
 
-    A ``stride`` that is a number is returned unchanged. ``auto`` balances two times of a step. The time of the pixels
-    falls with the square of the stride, the time of the primitives stays. Other strides learn less per second. The
-    result depends only on the arguments, not on measured times.
+    A ``stride`` that is a number is returned unchanged. ``auto`` makes a step spend as much time on pixels as on
+    primitives, because training learns less per second with other strides. The time of the pixels falls with the square
+    of the stride; the time of the primitives does not depend on the stride. The last stages of the training use smaller
+    strides. The result depends only on the arguments, not on measured times.
 
     Args:
         covered: mean number of covered pixels (alpha above 0) per view.
@@ -141,7 +143,7 @@ def choose_stride(stride: int | Literal["auto"], covered: float, primitives: int
 
 
 def draw_stride(stride: int, view: View, generator: torch.Generator) -> PixelStride:
-    """Select every ``stride``-th pixel from a random first one; lower the stride until 11 x 11 pixels remain."""
+    """Select every ``stride``-th pixel from a random first pixel; lower the stride until 11 x 11 pixels remain."""
     stride = max(min(stride, min(view.camera.width, view.camera.height) // _MIN_SIDE), 1)
     if stride == 1:
         return PixelStride()
@@ -156,7 +158,10 @@ def hash_training_views(views: ViewSet) -> str:
 
 
 class _NumbersOfViews:
-    """Parameters of each training view, which Adam learns in the steps that use the view, with initial ``rates``."""
+    """Learned numbers of each training view, for example its exposure. Adam updates them in steps that use the view.
+
+    ``rates`` are the initial learning rates of the numbers of one view.
+    """
 
     def __init__(self, views: int, rates: list[float], device: torch.device) -> None:
         self.rates = torch.tensor(rates, device=device)
@@ -166,12 +171,15 @@ class _NumbersOfViews:
         self._rows: dict[int, Tensor] = {}
 
     def row(self, index: int) -> Tensor:
-        """Return the parameters of view ``index`` as a new leaf tensor, whose gradient :meth:`gradient` returns."""
+        """Return the learned numbers of view ``index`` as a new leaf tensor; :meth:`gradient` returns its gradient."""
         self._rows[index] = row = self.numbers[index].clone().requires_grad_()
         return row
 
     def gradient(self, index: int) -> list[float] | None:
-        """Return the gradient of a view's corrections, which :meth:`row` returned before the backward pass, or None."""
+        """Return the gradient of the tensor that :meth:`row` returned for view ``index`` before the backward pass.
+
+        Returns None if the tensor got no gradient.
+        """
         grad = self._rows.pop(index).grad
         return None if grad is None else [float(x) for x in grad.tolist()]
 
@@ -222,15 +230,15 @@ class ViewCorrections(_NumbersOfViews):
     """Learned corrections of training views whose given cameras or conditions are inexact (``Dataset.refine``).
 
     The correction of a pose is a shift, and a rotation around the point that the cameras look at. A rotation around the
-    camera itself would move the image almost as a shift does, and Adam would learn both slowly. The part of the
-    corrections that moves, rotates or scales all cameras alike is removed. Images do not determine this part, and it
-    would move the model away from the held-out cameras.
+    camera itself would change the image almost as a shift does, so that Adam would learn rotation and shift slowly. The
+    part of the corrections that moves, rotates or scales all cameras alike is removed. Images do not determine this
+    part, and with it the model would no longer fit the held-out cameras.
 
     Args:
         cameras: (V, 4, 4) given world-to-camera matrices of the training views.
         kinds: "camera" or the name of a condition -> its correction, "pose", "offset" or "factor". A pose is a rotation
             vector and a shift in camera axes. An offset is added to a position. For a factor, the logarithm is learned.
-        unit: unit of shifts and offsets, in scene units.
+        unit: length of one unit of shifts and offsets, in scene units.
     """
 
     def __init__(self, cameras: Tensor, kinds: Mapping[str, Correction], unit: float, device: torch.device) -> None:
@@ -248,7 +256,8 @@ class ViewCorrections(_NumbersOfViews):
     def step_at(self, progress: float, gradients: Mapping[int, list[float] | None]) -> None:
         """Take an Adam step on the corrections of some views at ``progress``, the used fraction of the budget.
 
-        In the first tenth of the budget, nothing changes. ``gradients`` maps a view's index to its gradient.
+        ``gradients`` maps a view's index to the gradient of the view's corrections. In the first tenth of the budget,
+        no correction changes.
         """
         if progress < _CORRECTION_START:
             return
@@ -303,9 +312,9 @@ class ViewCorrections(_NumbersOfViews):
 def _looked_at(rotations: Tensor, shifts: Tensor) -> Tensor:
     """Return the (3,) point nearest to the optical axes of V cameras, which minimises the sum of squared distances.
 
-    World-to-camera matrices have the rotations (V, 3, 3) and shifts (V, 3). Axes that are parallel within about 3
-    degrees do not determine the point's depth. The point then has the depth of the mean camera centre, because a
-    rotation around a far point would move the cameras far.
+    ``rotations`` (V, 3, 3) and ``shifts`` (V, 3) are the parts of the world-to-camera matrices. Axes that are parallel
+    within about 3 degrees do not determine the depth of the point. The point then has the depth of the mean camera
+    centre, because a rotation around a far point would move the cameras far.
     """
     sideways = rotations[:, :2].flatten(0, 1)  # (2 V, 3): a point on an axis has the camera coordinates (0, 0, z)
     middle = -(rotations.transpose(1, 2) @ shifts[..., None]).mean(0)[:, 0]

@@ -1,13 +1,13 @@
 """The model's extinction on a regular grid, in 1/scene unit.
 
 The extinction at x is sigma(x) = sum of (1 - |y|^2)^p max(0, f(x~)) / m over the primitives whose ellipsoid contains x.
-An ellipsoid has centre mu, longest semi-axis m and edge p (how density fades at its boundary). y is x in coordinates
-where the ellipsoid is the unit ball, x~ = (x - mu) / m, and f is the primitive's cosine network. A negative f is
-clamped to 0 at every point; a renderer clamps the integral of f along a ray instead.
+An ellipsoid has centre mu, longest semi-axis m and edge exponent p (how density fades at the boundary). y is x in
+coordinates where the ellipsoid is the unit ball, x~ = (x - mu) / m, and f is the primitive's cosine network. A negative
+f is clamped to 0 at every point; a renderer clamps the integral of f along a ray instead.
 
-A neuron's phase is linear in the index along each axis. So its cosine at a grid point is the real part of a product of
-one complex number per axis. A primitive that spans n^3 points needs 3 n sines and cosines per neuron, and two
-multiplications per neuron and point.
+A neuron's phase is linear in the grid index along each axis. So the neuron's cosine at a grid point is the real part of
+a product of three complex numbers, one per axis. A primitive that spans n^3 points therefore needs only 3 n sines and
+cosines per neuron, and two multiplications per neuron and point.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ def box_lattice(bounds: np.ndarray | Tensor, resolution: int) -> tuple[Tensor, t
 def voxels_in_box(bounds: np.ndarray | Tensor, scene_from_index: np.ndarray) -> tuple[Tensor, tuple[int, int, int]]:
     """Return the part of a grid whose voxel centres lie in a box, as a matrix scene_from_index (4, 4) and a shape.
 
-    ``scene_from_index`` is the matrix of the whole grid. ``bounds`` (2, 3) is the box, in scene units. For a rotated
-    grid, the part is a block of voxels around the box.
+    ``scene_from_index`` is the matrix of the whole grid. ``bounds`` (2, 3) is the box, in scene units. If the grid is
+    rotated, the part is the block of voxels that contains the box.
     """
     corners = np.stack(np.meshgrid(*np.asarray(bounds, np.float64).T, indexing="ij"), -1).reshape(-1, 3)
     back = np.linalg.inv(scene_from_index)
@@ -68,8 +68,8 @@ def density_grid(
 ) -> Tensor:
     """Return (X, Y, Z) float32 extinctions, 1/scene unit, at ``scene_from_index @ (i, j, k, 1)``; on the CPU.
 
-    A density with the closed form :class:`~neuprim.core.model.fields.Cosine` runs in compiled code on all cores; any
-    other density is evaluated in blocks. Memory in addition to the grid is a few MB.
+    Compiled code on all cores evaluates a density with the closed form :class:`~neuprim.core.model.fields.Cosine`;
+    torch code evaluates any other density in blocks. Both need a few MB of memory in addition to the grid.
 
     Args:
         conditions: conditions of the frame, e.g. ``{"time": tensor(0.5)}``.
@@ -101,7 +101,10 @@ def density_grid(
 
 
 def density_at(model: Primitives, conditions: Conditions, points: Tensor) -> Tensor:
-    """Return the model's (M,) float64 extinctions, 1/scene unit, at (M, 3) points. Slow: visits every primitive."""
+    """Return the model's (M,) float64 extinctions, 1/scene unit, at (M, 3) points.
+
+    The function is slow, because it tests every point against every primitive.
+    """
     with torch.no_grad():
         active = model.to(device.HOST).active(conditions, torch.float64)
         geometry = active.geometry
@@ -118,9 +121,10 @@ def density_at(model: Primitives, conditions: Conditions, points: Tensor) -> Ten
 def _add_to_density_grid(
     model: Primitives, conditions: Conditions, ellipsoids: Any, P: np.ndarray, Q: np.ndarray, grid: np.ndarray
 ) -> None:
-    """Add the extinction of all primitives to ``grid``, by torch code and in a fixed order: sums are reproducible.
+    """Add the extinction of all primitives to ``grid``, by torch code.
 
-    ``ellipsoids`` has centres, semi-axes and rotations. P (4, 4) maps grid indices to the scene, Q (4, 4) back.
+    The order of the primitives is fixed, so that the sums are reproducible. ``ellipsoids`` has centres, semi-axes and
+    rotations. P (4, 4) maps grid indices to the scene, Q (4, 4) maps the scene to grid indices.
     """
     active = model.active(conditions, torch.float64)
     for n, (mean, scale, R) in enumerate(zip(*(x.detach().numpy() for x in ellipsoids), strict=True)):

@@ -49,10 +49,10 @@ class DensityGridPlacement:
         numbers: number of each frame.
         times: condition that differs between frames -> its value per frame, e.g. ``{"time": [0.0, 0.5, 1.0]}``.
         sigma_per_unit: extinction, 1/scene unit, of a grid value of 1.
-        grid: name of the absorbing grid.
-        exact: whether the extinction comes from that grid alone; if False, other grids add to the extinction.
-        component: name, in models, of the part of the extinction that comes from the grid.
-        extents: extents of the grid in every frame; empty if unknown.
+        grid: name of the absorbing grid, whose values are extinctions.
+        exact: whether all extinction comes from the absorbing grid; if False, other grids add to the extinction.
+        component: name that models use for the part of the extinction from the absorbing grid.
+        extents: largest value and bounding box of the absorbing grid, for each frame; empty if unknown.
     """
 
     scene_from_world: np.ndarray
@@ -65,7 +65,10 @@ class DensityGridPlacement:
     extents: Sequence[GridExtent] = ()
 
     def matches(self, other: DensityGridPlacement) -> bool:
-        """Return whether ``other`` has the same frame numbers, transform, grid and factor from values to extinction."""
+        """Return whether ``other`` has the same frame numbers, transform, absorbing grid and extinction per grid value.
+
+        The attributes compared are ``numbers``, ``scene_from_world``, ``grid``, ``exact`` and ``sigma_per_unit``.
+        """
         keys = ("scene_from_world", "numbers", "sigma_per_unit", "grid", "exact")
         mine, theirs = self.to_json(), other.to_json()
         return all(mine[key] == theirs[key] for key in keys)
@@ -156,26 +159,29 @@ class DensityTruth(ABC):
         """Return the (X, Y, Z) float32 extinction, 1/scene unit, at the points ``scene_from_index @ (i, j, k, 1)``.
 
         Args:
-            component: name of a source grid, for the extinction from this grid alone; None for all of it.
+            component: name of a source grid, for the extinction from this grid alone; None for the whole extinction.
         """
 
 
 class VoxelLook(NamedTuple):
-    """Emission and scattering of M voxels of a frame, in linear light per scene unit."""
+    """Emission and scattering of M voxels of a frame, in linear light per scene unit.
+
+    ``scattered`` is None if nothing scatters light, or if ``emission`` includes the scattered light.
+    """
 
     points: np.ndarray  # (M, 3) float64 centres, scene units
     emission: np.ndarray  # (M, 3) extinction times emitted radiance
-    scattered: np.ndarray | None  # (M, 3) extinction times scattering albedo; None if the light is part of the emission
+    scattered: np.ndarray | None  # (M, 3) extinction times scattering albedo
 
 
 class DensityGridSource(DensityTruth):
     """Base class of ground truth in voxel files, read one frame at a time."""
 
-    placement: DensityGridPlacement  # has the same frames
+    placement: DensityGridPlacement  # position and units of the files; has the same frames as the ground truth
 
     @abstractmethod
     def grid_transform(self, frame: int) -> np.ndarray | None:
-        """Return the (4, 4) float64 world_from_index of a frame's absorbing grid; None if the frame has none."""
+        """Return the (4, 4) float64 matrix world_from_index of a frame's absorbing grid; None without such a grid."""
 
     def look(self, frame: int) -> VoxelLook | None:
         """Return the emission and scattering of a frame's voxels; None if they are unknown or the frame is empty."""
@@ -194,7 +200,7 @@ class DensityGridSource(DensityTruth):
 
 
 class DensityComparison:
-    """Errors of a model's extinction against the true one, added up block by block in float64."""
+    """Errors of a model's extinction against the true extinction, added up block by block in float64."""
 
     def __init__(self) -> None:
         self.points = self.active = 0
@@ -218,8 +224,8 @@ class DensityComparison:
         """Return name -> value for each of :data:`DENSITY_ERRORS`; None if the truth is the same everywhere.
 
         ``correlation`` is Pearson's and ``relative_l2`` is |values - truth| / |truth|, both over all points.
-        ``psnr_active`` is over the points where the truth is not 0, with the largest true value as peak. ``max_error``
-        is the largest error of all points, divided by that peak.
+        ``psnr_active`` is the PSNR in dB over the points where the truth is not 0; the peak is the largest true value.
+        ``max_error`` is the largest absolute error of all points, divided by the same peak.
         """
         n = max(self.points, 1)
         a, b, aa, bb, ab = (float(x) for x in self.sums)
@@ -241,12 +247,12 @@ def measure_density_errors(
     threads: int = 0,
     component: str | None = None,
 ) -> dict[str, float] | None:
-    """Return the errors of the model under ``conditions`` against a frame of the truth.
+    """Return the errors of the model's extinction under ``conditions`` against one frame of the ground truth.
 
-    The result is that of :meth:`DensityComparison.errors`.
+    The errors are those of :meth:`DensityComparison.errors`; None for an empty frame.
 
     Args:
-        component: name of a source grid, to compare only the extinction from this grid; None for all of it.
+        component: name of a source grid, to compare only the extinction from this grid; None for the whole extinction.
     """
     place = truth.points(frame)
     if place is None:

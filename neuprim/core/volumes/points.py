@@ -44,11 +44,13 @@ class PointValues(NamedTuple):
 
     Attributes:
         sigma: (M,) extinction, 1/scene unit.
-        source: (M, C) sigma times colour; None if not requested, or if all of the colour depends on direction.
+        source: (M, C) sum of sigma_i times the colour of primitive i; None if not requested, or if the whole colour
+            depends on direction.
         rows: (N,) int64 rows of the primitives that are active in the frame, None for all.
         shares: contributions of the active primitives; zeros until a backward pass.
         components: name of a source grid -> (M,) part of sigma that comes from this grid.
-        scattered: (M, C) sigma times :meth:`~neuprim.core.model.fields.ColourField.scattering`; None if the source is.
+        scattered: (M, C) sum of sigma_i times :meth:`~neuprim.core.model.fields.ColourField.scattering`; None if
+            ``source`` is None, or if the field does not separate scattered light.
     """
 
     sigma: Tensor
@@ -59,9 +61,9 @@ class PointValues(NamedTuple):
     scattered: Tensor | None
 
     def request_shares(self, error: Tensor) -> PointShares:
-        """Return the object that will hold each primitive's contribution to ``error`` (M,), which gets no gradient.
+        """Return the object to which the backward pass writes each primitive's contribution to ``error`` (M,).
 
-        The backward pass fills it.
+        ``error`` gets no gradient.
         """
         self.shares.error = error.detach()
         return self.shares
@@ -79,8 +81,8 @@ def volume_values_at(
         threads: number of threads, 0 for all cores; the result does not depend on it.
 
     Raises:
-        NonFiniteError: a parameter is NaN or infinite, or so large that the values are NaN or infinite. On a GPU, where
-            finding out would take a wait, the values are NaN instead.
+        NonFiniteError: a parameter is NaN or infinite, or so large that the values are NaN or infinite. Compiled code
+            on a GPU returns NaN values instead, because a check would have to wait for the GPU.
     """
     compiled = device.on_warp(model.params["means"]) and model.density.stage is not None
     active = model.active(conditions, everything=compiled)
@@ -116,14 +118,15 @@ def weighted_extinctions_at(
     shares: PointShares | None = None,
     threads: int = 0,
 ) -> Tensor:
-    """Return (M, 1 + C) float32 at ``points`` (M, 3): the extinction, and its sums weighted by ``weights`` (N, C).
+    """Return (M, 1 + C) float32 sums over N primitives at ``points`` (M, 3): extinction, and extinction x ``weights``.
 
     Column 0 is the sum of sigma_i, the extinction of primitive i. Column 1 + c is the sum of sigma_i x weights[i, c].
 
     Args:
-        active: the N primitives of a frame.
-        form: closed form of their density.
-        shares: filled by the backward pass.
+        active: the N active primitives of a frame.
+        form: closed form of the primitives' density.
+        weights: (N, C) factors of the extinction of each primitive.
+        shares: object that the backward pass fills with the contribution of each primitive; None for none.
         threads: number of threads, 0 for all cores; the result does not depend on it.
 
     Raises:
@@ -191,8 +194,8 @@ def _torch_density_point_values(
 def find_point_pairs(geometry: Geometry, cells: PointCells) -> tuple[Tensor, Tensor]:
     """Return the P pairs of a point and a primitive whose ellipsoid contains the point, primitive by primitive.
 
-    The pairs are two (P,) int64 tensors: rows of ``cells.points``, and rows (indices) of primitives. Runs on the device
-    of the geometry; synchronises three times.
+    The pairs are two (P,) int64 tensors: rows of ``cells.points``, and rows (indices) of primitives. The function runs
+    on the device of the geometry, and waits for a GPU three times.
     """
     means, scales, axes = (x.detach().double() for x in (geometry.means, geometry.scales, geometry.rotations.double()))
     starts, low, counts, points = (

@@ -1,4 +1,4 @@
-"""CPU path of :mod:`neuprim.core.volumes.points`: points sorted into cells, and compiled sums of cosine densities."""
+"""CPU path of :mod:`neuprim.core.volumes.points`: sort points into cells, and sum cosine densities by kernels."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ class PointCells(NamedTuple):
     """Points sorted into the cells of a uniform grid.
 
     Attributes:
-        order: (M,) int64 indices of the given points, cell by cell.
-        points: (M, 3) float64 points in that order.
+        order: (M,) int64 indices of the points before sorting, listed cell by cell.
+        points: (M, 3) float64 sorted points, in the sequence of ``order``.
         starts: (X Y Z + 1,) int64 position in ``points`` of each cell's first point.
-        low, counts: lowest corner of the grid, (3,) float64, and its numbers of cells X, Y, Z, (3,) int64.
+        low: (3,) float64 lowest corner of the grid.
         step: edge length of a cell.
+        counts: (3,) int64 numbers of cells X, Y and Z along the axes.
     """
 
     order: np.ndarray
@@ -40,7 +41,7 @@ class PointCells(NamedTuple):
 
 
 def sort_points_into_cells(points: np.ndarray) -> PointCells:
-    """Sort (M, 3) points into a grid, so fine that each cell contains few points."""
+    """Sort (M, 3) points into the cells of a grid that is fine enough for few points per cell."""
     if len(points) == 0:
         points, low, step, counts = np.zeros((0, 3)), np.zeros(3), 1.0, np.ones(3, np.int64)
     else:
@@ -57,9 +58,10 @@ def sort_points_into_cells(points: np.ndarray) -> PointCells:
 class CosinePointValues(torch.autograd.Function):
     """Autograd function for sums of cosine densities at M points; the result is (M, 1 + C) float32.
 
-    Column 0 is the extinction, the sum of sigma_i over primitives i; the C others are sums weighted by ``weights`` (N,
-    C). ``cells`` has the points and ``edge`` is the exponent p. The backward pass fills ``shares``, a PointShares.
-    Arguments with a gradient: (means, log_scales, quats, W1, b1, w2, b2, weights), each with one row per primitive.
+    Column 0 is the extinction, the sum of sigma_i over primitives i. Column 1 + c is the sum of sigma_i times
+    weights[i, c]. ``cells`` has the points, and ``edge`` is the exponent p of (1 - |y|^2)^p. The backward pass fills
+    ``shares``, a PointShares. The arguments with a gradient are (means, log_scales, quats, W1, b1, w2, b2, weights),
+    each with one row per primitive.
     """
 
     @staticmethod
@@ -234,7 +236,7 @@ def _merge_density_point_sums(start, stop, parts, order, merged):  # type: ignor
 def _density_point_cell_span(center, reach, low, step, count):  # type: ignore[no-untyped-def]
     """Return the first and last grid cell, along one axis, that the interval ``center`` +- ``reach`` meets.
 
-    If the interval misses the grid, the first is ``count`` or the last is -1.
+    If the interval misses the grid, the first cell is ``count`` or the last cell is -1, which gives an empty range.
     """
     first = int(np.floor(min(max((center - reach - low) / step, 0.0), float(count))))
     return first, int(np.floor(min(max((center + reach - low) / step, -1.0), float(count - 1))))
@@ -272,7 +274,7 @@ def _density_at_point_offset(rate, phase, amplitude, offset, n, dx, dy, dz):  # 
 def _add_density_point_values(start, stop, cells, reach, prims, edge, chunk, sums):  # type: ignore[no-untyped-def]
     """Add extinctions of primitives start:stop at M points to part ``start // chunk`` of ``sums`` (parts, M, 1 + C).
 
-    Column 0 gets a primitive's extinction sigma, column 1 + c gets sigma times its weight c (``colors``).
+    Column 0 gets a primitive's extinction sigma. Column 1 + c gets sigma times the primitive's weight ``colors[n, c]``.
 
     Args:
         reach, prims: filled by :func:`_prepare_point_axes` and :func:`_prepare_point_neurons`, for all primitives.
@@ -307,8 +309,8 @@ def _add_density_point_values(start, stop, cells, reach, prims, edge, chunk, sum
 def _density_point_values_backward(start, stop, cells, reach, prims, edge, pulled, error, gradients, shares):  # type: ignore[no-untyped-def]
     """Fill ``gradients``, given as zeros, of ``prims`` from ``pulled`` (M, 1 + C), the gradients of the sums at points.
 
-    ``pulled`` and ``error`` (M,) are in the order of ``cells``. ``shares`` (N, 2) gets each primitive's sums over
-    points of its extinction sigma and of sigma x ``error``.
+    ``pulled`` and ``error`` (M,) are in the order of the sorted points in ``cells``. ``shares`` (N, 2) gets two sums
+    over the points for each primitive: of its extinction sigma, and of sigma x ``error``.
     """
     points, starts, counts = cells.points, cells.starts, cells.counts
     means, A, rate, phase, amplitude, offset, colors = prims

@@ -1,9 +1,10 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """GPU path of :mod:`neuprim.core.volumes.points`: sums of cosine densities at points, by Warp kernels in float64.
 
-A thread adds up part of the primitives at one point or, in the backward pass, part of the points of one primitive. The
-parts are summed in a fixed order, so reruns give the same bits. The points are not sorted into a grid. For a few
-thousand points, testing each against every primitive's box takes only a few instructions per test.
+In the forward pass, a thread adds up the densities of part of the primitives at one point. In the backward pass, a
+thread adds up the gradients of one primitive over part of the points. The partial sums are added in a fixed order, so
+reruns give the same bits. The points are not sorted into a grid, because a test of a point against a primitive's box
+takes only a few instructions, and there are only a few thousand points.
 """
 
 from __future__ import annotations
@@ -101,11 +102,10 @@ def _add_points(
     g_means: Vec3ds, g_A: Mat33ds, g_rate: Vec3ds2d, g_phase: Doubles2d, g_amplitude: Doubles2d,
     g_constant: Doubles, g_weights: Doubles2d, shares: Doubles2d,
 ):  # fmt: skip
-    """Add up the gradients of one of N primitives over some points; also the sums of sigma and of sigma x error.
+    """Add up the gradients of one of N primitives over some points, and ``shares``: sums of sigma and sigma x error.
 
-    These two sums are ``shares``. Thread (part, n) takes primitive n and points part, part + 8, ..., and writes row
-    part x N + n. The gradient arrays are given as zeros. ``pulled`` is the gradient of the loss by the values at the
-    points.
+    Thread (part, n) takes primitive n and points part, part + 8, ..., and writes row part x N + n. The gradient arrays
+    are given as zeros. ``pulled`` is the gradient of the loss by the values at the points.
     """
     part, n = wp.tid()
     row = part * means.shape[0] + n

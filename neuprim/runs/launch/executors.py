@@ -86,7 +86,7 @@ def _cannot_begin(error: BaseException) -> JobResult:
 class ProcessExecutor:
     """Executor of ``launcher=processes``: worker processes that are reused from one task to the next.
 
-    Each worker is a pool with one process. If the system kills the process, only that pool breaks.
+    Each worker is a pool with one process. If the system kills the process, the other pools are not affected.
 
     Args:
         folder: folder for the workers' logs.

@@ -85,9 +85,9 @@ def launch_jobs(
     ``on_status`` and ``on_result`` are called with (index of a job, its status or result).
 
     Args:
-        folder: shared folder of launcher and workers, under the same path on all machines. It is removed afterwards,
-            unless workers printed something.
-        stop_at_failure: whether the first job that fails stops the others like Ctrl-C.
+        folder: shared folder of launcher and workers, under the same path on all machines. The folder is removed
+            afterwards, unless workers printed something.
+        stop_at_failure: whether the first job that fails stops all other jobs, as Ctrl-C does.
 
     Returns:
         Results in the order of the jobs; None for jobs that did not start.

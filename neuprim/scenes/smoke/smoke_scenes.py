@@ -1,13 +1,13 @@
 """The built-in smoke scenes, simulated as sequences of OpenVDB files.
 
-    NAME_0.vdb ... NAME_{T-1}.vdb     fog volumes of half floats, Blosc; numbers without padding, as by EmberGen
+    NAME_0.vdb ... NAME_{T-1}.vdb     fog volumes of half floats, Blosc; no leading zeros, as in files of EmberGen
 
     density        amount of smoke
     temperature    0 is the temperature of the air
     flames         burning fuel (scenes with fire)
     color          albedo of the smoke, vec3s, not multiplied by density (scenes with colours)
 
-Values are about 0 to 1. Voxels are cubes. The simulation box is one world unit wide and deep, centred at x = y = 0. Its
+Values are about 0 to 1. Voxels are cubes. The simulation box is one world unit wide and deep, centred at x = y = 0. The
 ground is at z = 0, and z is up. Each scene defines sources and forces over time, with smooth random turbulence.
 """
 
@@ -37,7 +37,7 @@ SOLVER_VERSION = 1
 """Part of the cache's key: raise it with every change to the solver, the scenes' sources or the files' layout."""
 
 THRESHOLD = 2e-3
-"""Grid values below this limit are written as background. They are invisible, and files stay small."""
+"""Grid values below this limit are written as background, so that files are small. Such values are invisible."""
 
 Resolution = Annotated[int, Range(16, 192)]
 """Number of cells across the simulation box. The limit exists because float32 counts cells exactly only up to 2^24."""
@@ -54,8 +54,8 @@ class TurbulenceNoise:
     """Value noise (random numbers on a lattice, smoothly interpolated) with mean 0 and unit variance at the nodes.
 
     The noise depends only on seed, channel, position and time, not on time steps or resolution. Channels are
-    independent. Methods take ``cells``, the lattice cells per world unit, and ``tempo``, the new random fields per
-    second.
+    independent. Arguments of the methods: ``cells`` is the number of lattice cells per world unit. ``tempo`` is the
+    number of new random fields per second.
     """
 
     def __init__(self, seed: int) -> None:
@@ -69,7 +69,8 @@ class TurbulenceNoise:
     def field(self, channel: int, axes: Axes, cells: float, tempo: float, time: float) -> Tensor:
         """Return (X, Y, Z) noise of one channel at ``time``, seconds, on the grid of coordinates ``axes``.
 
-        ``cells``: lattice cells per world unit. ``tempo``: new random fields per second, blended in between.
+        ``cells``: lattice cells per world unit. ``tempo``: new random fields per second. Between the times of two
+        fields, the fields are blended.
         """
         phase = max(time, 0.0) * tempo
         key = math.floor(phase)
@@ -80,7 +81,10 @@ class TurbulenceNoise:
         return torch.matmul(x, planes).reshape(len(x), len(y), len(z))
 
     def fractal(self, channel: int, axes: Axes, cells: float, tempo: float, time: float, octaves: int = 3) -> Tensor:
-        """Return a sum of ``octaves`` of :meth:`field`; each is twice as fine, half as strong and 1.5 times as fast."""
+        """Return a sum of ``octaves`` fields of :meth:`field`.
+
+        Each octave is twice as fine, half as strong and 1.5 times as fast as the octave before.
+        """
         fields = (self.field(channel + 101 * k, axes, cells * 2**k, tempo * 1.5**k, time) for k in range(octaves))
         return torch.stack([field * 0.5**k for k, field in enumerate(fields)]).sum(0)
 
@@ -91,7 +95,10 @@ class TurbulenceNoise:
 
 
 def _smoke_lattice_weights(places: Tensor) -> Tensor:
-    """Return the (n, _PERIOD) weights of lattice nodes at n ``places``, in cells. Cubic, so slopes are continuous."""
+    """Return the (n, _PERIOD) weights of the lattice nodes at n coordinates ``places``, in cells, along one axis.
+
+    The weights are cubic polynomials, so that the noise has continuous slopes.
+    """
     lower = places.floor()
     part = places - lower
     part = part * part * (3 - 2 * part)
@@ -106,7 +113,8 @@ def _smoke_lattice_weights(places: Tensor) -> Tensor:
 class SmokeStage:
     """Simulation box of a smoke scene, with coordinates of cell centres (``axes``), noise, and ``fade``.
 
-    ``fade`` (X, Y, Z), 1/s, is the rate at which gas vanishes near the sides and the top, so that nothing is cut off.
+    ``fade`` (X, Y, Z), 1/s, is the rate at which gas vanishes near the sides and the top of the box, so that smoke is
+    not cut off there.
     """
 
     def __init__(self, box: SmokeBox, seed: int) -> None:
@@ -133,9 +141,10 @@ class SmokeStage:
 
 @dataclass(frozen=True)
 class SmokeScene:
-    """A simulated smoke scene: number of frames, seconds per frame, and the gas properties (``solver``).
+    """A simulated smoke scene: default number of frames, seconds per frame, and the gas properties (``solver``).
 
-    ``grids`` names the OpenVDB grids to write, e.g. "density". ``forcing`` returns the sources and forces at a time, s.
+    ``grids`` names the OpenVDB grids to write, e.g. "density". ``forcing`` returns the sources and forces at a time in
+    seconds.
     """
 
     name: str
@@ -152,7 +161,10 @@ class SmokeScene:
 
 
 def _soft_smoke_source_edge(distance: Tensor, width: float) -> Tensor:
-    """Return a smooth step of the signed ``distance``: 1 inside (negative), 0 outside, over a range ``width``."""
+    """Return a smooth step of the signed ``distance``: 1 inside (negative), 0 outside.
+
+    The step falls from 1 to 0 over distances from -``width`` / 2 to ``width`` / 2.
+    """
     t = (0.5 - distance / width).clamp(0, 1)
     return t * t * (3 - 2 * t)
 
@@ -360,7 +372,7 @@ def simulate_smoke(
     Args:
         name: one of :data:`SMOKE_SCENES`.
         frames: number of frames, at most :data:`MAX_TIMESTEPS`; None for the default number of the scene.
-        resolution: cells across the box, which is 1.5 times as high as wide.
+        resolution: cells across the width of the box. The height of the box is 1.5 times its width.
         seed: seed of the turbulence; not negative.
 
     Raises:
@@ -432,7 +444,10 @@ def make_smoke_grids(state: GasState, scene: SmokeScene, box: SmokeBox) -> list[
 
 @contextmanager
 def _solve_smoke_on_one_thread() -> Iterator[None]:
-    """Context manager: run torch on one thread. Results then do not depend on the solver's own number of threads."""
+    """Return a context manager that runs each torch operation on one thread.
+
+    Results then do not depend on the number of threads of torch or of the solver.
+    """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

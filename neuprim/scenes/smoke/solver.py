@@ -1,10 +1,11 @@
 """Fluid solver for smoke and fire: staggered grid in a box, semi-Lagrangian advection, combustion, exact projection.
 
-Marker-and-cell layout (Harlow and Welch 1965): scalars at the cells' centres, each velocity component at the centres of
-the faces that it crosses. Divergence and gradient are differences over one cell. Their product, the 7-point Laplacian,
-is a sum of one tridiagonal matrix per axis. Diagonalising these three small matrices solves the pressure's Poisson
-equation directly (Lynch, Rice and Thomas 1964, "Direct solution of partial difference equations by tensor product
-methods"). The solution needs no iteration and no tolerance, and allows any combination of solid and open ends.
+The grid has the marker-and-cell layout (Harlow and Welch 1965): scalars are stored at the centres of cells, velocity
+components at the centres of the faces that they cross. Divergence and gradient are differences over one cell. The
+divergence of a gradient, the 7-point Laplacian, is therefore a sum of one tridiagonal matrix per axis. Diagonalising
+these three small matrices solves the pressure's Poisson equation directly (Lynch, Rice and Thomas 1964, "Direct
+solution of partial difference equations by tensor product methods"). The solution needs no iteration and no tolerance,
+and allows any combination of solid and open ends.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ _ENDS = ((True, True), (True, True), (False, True))
 class SmokeBox:
     """Simulation box of X x Y x Z cubic cells over a solid ground; z is up.
 
-    The box is centred at x = y = 0 and stands on z = 0. Outside its sides and top, the pressure is zero and air can
-    flow in and out. Nothing flows through the ground. ``cell`` is the edge of a cell in world units.
+    The box is centred at x = y = 0 and stands on z = 0. Air can flow in and out through the sides and the top, because
+    the pressure outside is zero. Nothing flows through the ground. ``cell`` is the edge of a cell in world units.
     """
 
     shape: tuple[int, int, int]
@@ -87,7 +88,10 @@ def flow_divergence(velocity: Faces, box: SmokeBox) -> Tensor:
 
 
 def project_velocity(velocity: Faces, box: SmokeBox) -> Faces:
-    """Return the divergence-free part of the flow u: u - grad p with laplace p = div u. No gas crosses the ground."""
+    """Return the divergence-free part u - grad p of the flow u; the pressure p solves laplace p = div u.
+
+    No gas crosses the ground.
+    """
     u, v, w = velocity
     w = w.clone()
     w[:, :, 0] = 0
@@ -97,8 +101,8 @@ def project_velocity(velocity: Faces, box: SmokeBox) -> Faces:
 def expansion_flow(source: Tensor, box: SmokeBox) -> Faces:
     """Return the irrotational flow with divergence ``source`` (X, Y, Z), 1/s, e.g. of heated gas that expands.
 
-    The solver adds this flow for advection only. The stored velocity remains divergence-free, so that the expansion
-    ends when its cause ends.
+    The solver adds this flow to the velocity for advection only. The stored velocity remains divergence-free, so that
+    the expansion ends as soon as ``source`` is 0.
     """
     return _subtract_gradient(box.air_at_rest(), -box.solve_pressure(source), box)
 
@@ -120,7 +124,10 @@ def _smoke_solver_flow_at_centres(velocity: Faces) -> Tensor:
 
 
 def _smoke_solver_flow_at_faces(centred: Tensor) -> Faces:
-    """Return velocity on the faces: the mean of the two adjacent cells of ``centred``, or the only one at an end."""
+    """Return the velocity on cell faces: the mean of the two adjacent cells of ``centred`` (3, X, Y, Z).
+
+    A face at an end of the box has the value of its only adjacent cell.
+    """
     parts = []
     for axis, field in enumerate(centred):
         first, last, count = field.narrow(axis, 0, 1), field.narrow(axis, -1, 1), field.shape[axis] - 1
@@ -139,14 +146,15 @@ class GasProperties:
     Attributes:
         buoyancy: upward acceleration at temperature 1.
         weight: downward acceleration at density 1.
-        confinement: strength of vorticity confinement; 0 is none, above 1 is noise.
+        confinement: strength of vorticity confinement; 0 is no confinement, values above 1 give noise.
         cooling, dissipation, drag: relative losses of temperature, density and velocity per second.
-        radiation: further loss of temperature per second at temperature 1, proportional to its fourth power.
-        burn: fuel burnt per second, at any concentration; a flame burns for 1 / burn seconds.
+        radiation: further loss of temperature per second, proportional to the fourth power of the temperature; the
+            value is the loss at temperature 1.
+        burn: fuel burnt per second. It does not depend on the concentration, so a flame burns for 1 / burn seconds.
         heat, soot, expansion: temperature, density and volume produced per unit of burnt fuel.
-        smoothing: 0..1, share by which each step blends face velocities with the mean of adjacent cells' velocities.
+        smoothing: 0..1; each step blends face velocities by this share with the mean of the adjacent cells' velocities.
         cfl: cells that gas may cross in one step; faster gas leads to more steps per frame.
-        most_steps: maximum number of steps per frame, even if gas then crosses more than ``cfl`` cells.
+        most_steps: maximum number of steps per frame, even if gas then crosses more than ``cfl`` cells in a step.
     """
 
     buoyancy: float = 2.0
@@ -171,8 +179,8 @@ class GasState:
 
     Attributes:
         velocity: divergence-free velocity, stored on the faces of the cells.
-        density, temperature, fuel: (X, Y, Z) float32. Fuel is the reaction coordinate: 1 as it leaves the source, 0
-            when burnt.
+        density, temperature, fuel: (X, Y, Z) float32. Fuel is the reaction coordinate: 1 for fuel that leaves the
+            source, 0 for burnt fuel.
         colour: (3, X, Y, Z) albedo times density, so that mixed smoke has a weighted mean albedo; or None.
     """
 
@@ -195,8 +203,9 @@ class GasSource(NamedTuple):
 
     Attributes:
         where: slices of the cells of the region.
-        rate: (x, y, z) per second; in a time t, the difference from the values is multiplied by exp(-rate * t).
-        density, temperature, fuel: the given values, numbers or fields over ``where``.
+        rate: (x, y, z) per second; in a time t, the difference between gas and given value is multiplied by
+            exp(-rate * t).
+        density, temperature, fuel: the given values, as numbers or as fields over the region ``where``.
         colour: albedo of the smoke, three numbers.
         velocity: (3, x, y, z), world units per second.
     """
@@ -214,8 +223,9 @@ class GasForcing(NamedTuple):
     """Sources and forces that act on the gas at one time.
 
     Attributes:
-        sources: applied in order.
-        gusts: (3, X, Y, Z) acceleration, multiplied by min(1, 2 (density + temperature + fuel)).
+        sources: sources, which are applied in this order.
+        gusts: (3, X, Y, Z) acceleration, multiplied by min(1, 2 (density + temperature + fuel)), so that it does not
+            move clear, cold air.
         expansion: (X, Y, Z) volume produced per volume and second.
         fade: (X, Y, Z) per second, rate at which smoke, heat and fuel vanish near open ends.
     """
@@ -301,8 +311,9 @@ def _gas_acceleration(
 ) -> Tensor:
     """Return the (3, X, Y, Z) acceleration of gas: buoyancy, weight and vorticity confinement e h (N x w).
 
-    e is ``settings.confinement``, h the edge of a cell, w = curl u the vorticity of the velocity u, and N = grad |w| /
-    |grad |w|| (Fedkiw, Stam and Jensen 2001). Confinement restores the small eddies that interpolation damps.
+    Confinement restores the small eddies that interpolation damps (Fedkiw, Stam and Jensen 2001). e is
+    ``settings.confinement``, h the edge of a cell, w = curl u the vorticity of the velocity u, and N = grad |w| /
+    |grad |w||.
     """
     if settings.confinement:
         w = _vorticity(velocity, box.cell)
@@ -361,7 +372,7 @@ _INVISIBLE = 1e-4  # values up to this are not corrected; most of a box holds no
 class _SmokeSolverStencil(NamedTuple):
     """Stencils (eight cells and weights each) that interpolate a table of cell values (X * Y * Z, C) at N points.
 
-    They are read with torch's ``embedding_bag``, which is several times faster than ``grid_sample`` in three
+    Stencils are evaluated with torch's ``embedding_bag``, which is several times faster than ``grid_sample`` in three
     dimensions. The result is the same for any number of threads.
     """
 

@@ -69,7 +69,7 @@ def _build_time_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[Dens
     settings = (model["sh_degree"], dataset.channels, model["sh_every"])
     if "light" in dataset.train.view(0).conditions:
         if dataset.channels != 3:
-            found = f"{dataset.name}: {dataset.channels} colour channels"
+            found = f"{dataset.name}: images have {dataset.channels} colour channels"
             raise ConfigError(f"{found}; task dynamic needs 3 channels if views have a light, because lights are RGB")
         more: dict[str, Any] = {**model["colour"], "typical": typical_light(dataset, False)}
         recording = vdb_recording_of(dataset)
@@ -113,7 +113,7 @@ def parse_dynamic_time(text: str) -> list[Tensor]:
 
 
 def vdb_recording_of(dataset: Dataset) -> VolumeRecording | None:
-    """Return the volume sequence from which a dataset's images were rendered; None if there is none.
+    """Return the volume sequence from which a dataset's images were rendered; None for other datasets.
 
     Raises:
         DatasetError: the dataset's ``extra`` is something else.
@@ -145,7 +145,10 @@ def held_out_clips(dataset: Dataset) -> Sequence[Clip]:
 
 
 def compare_with_vdb_recording(dataset: Dataset, model: Primitives) -> dict[str, Any]:
-    """Return errors of a model's extinction against its dataset's .vdb files, and facts on both; {} without files."""
+    """Return errors of a model's extinction against the dataset's .vdb files, and facts about model and files.
+
+    The result is empty for datasets without .vdb files.
+    """
     recording = vdb_recording_of(dataset)
     if recording is None:
         return {}
@@ -166,8 +169,8 @@ def invisible_fraction_over_time(model: Primitives, times: Sequence[Tensor]) -> 
 
     Along axis j, with direction r_j and semi-axis s_j, the optical depth of the chord through the centre is I = (N_p
     s_j/m) (b2 + sum_k w2_k cos(omega0 b1_k) B_p(omega0 W1_k . r_j s_j/m)). W1, b1, w2 and b2 are the primitive's
-    parameters at the time, m is the largest semi-axis. :mod:`neuprim.core.model.edge` defines N_p and B_p for the
-    exponent p of the edge (how density fades at the ellipsoid's boundary).
+    parameters at the time; omega0 is a constant frequency; m is the largest semi-axis. p is the exponent of the edge
+    (how density fades at the ellipsoid's boundary). :mod:`neuprim.core.model.edge` defines N_p and B_p.
     """
     most_opaque = torch.zeros(model.count, dtype=torch.float64)
     density, params = model.density, {k: v.detach() for k, v in model.of(model.density).items()}

@@ -18,8 +18,9 @@ from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.tasks.dynamic.time_density import get_frame_time
 
 FREQUENCIES = {"periods": 2 * math.pi, "printed": 1.0}
-"""Setting -> frequency w of the first Fourier term, in radians per sequence. "printed" is the paper's, which makes the
-terms nearly linearly dependent (condition number 5e13). "periods" fits whole periods into the sequence (2e5)."""
+"""Setting -> frequency w of the first Fourier term, in radians per sequence. "printed" is the frequency in the paper,
+at which the terms are nearly linearly dependent (condition number 5e13). With "periods", every term has a whole number
+of periods in the sequence (condition number 2e5)."""
 
 _TIME_TENSORS = ("time_poly", "time_cos", "time_sin")
 
@@ -45,7 +46,7 @@ class TimeHarmonics(ColourField):
         if not isinstance(channels, int) or channels < 1:
             raise ValueError(f"{channels!r} colour channels; expected at least 1")
         if not all(isinstance(n, int) and 0 <= n <= 16 for n in (powers, waves)):
-            raise ValueError(f"{powers!r} powers and {waves!r} waves; expected 0..16")
+            raise ValueError(f"powers {powers!r} and waves {waves!r}; expected 0..16 for each")
         if frequencies not in FREQUENCIES:
             raise ValueError(f"frequencies {frequencies!r}; expected {' or '.join(FREQUENCIES)}")
         self.degree, self.channels, self.sh_every = degree, channels, sh_every
@@ -103,7 +104,7 @@ class TimeHarmonics(ColourField):
         return field, {**others, **kept, "sh_dc": dc[:, 0].contiguous()}
 
     def _terms(self, xi: Tensor) -> dict[str, Tensor]:
-        """Return coefficient tensor -> float64 values of its basis (powers, cosines or sines) at the time ``xi``."""
+        """Return name of a parameter tensor -> float64 basis values (powers, cosines or sines) at the time ``xi``."""
         turn = FREQUENCIES[self.frequencies] * xi
         waves = turn * torch.arange(1, self.waves + 1, dtype=torch.float64, device=xi.device)
         powers = xi ** torch.arange(1, self.powers + 1, dtype=torch.float64, device=xi.device)
@@ -124,7 +125,7 @@ class TimeHarmonics(ColourField):
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
         """Return prunable units (parameters that pruning zeroes together).
 
-        There is one per channel and SH coefficient above degree 0, and one per term in time.
+        There is one unit per channel and SH coefficient above degree 0, and one unit per term in time.
         """
         terms = ((name, i) for name, count in self._term_counts() for i in range(count))
         units = (PrunableUnit(f"{name} {i + 1}", {name: (i,)}) for name, i in terms)

@@ -1,8 +1,9 @@
 """Load images of a moving scene with known cameras: ``transforms`` files as in D-NeRF, with a ``time`` per image.
 
-There is either one ``transforms_SPLIT.json`` per split (z is up), or one ``transforms.json``. If both exist, the former
-are used. In a ``transforms.json``, every n-th image by name is a test view, unless the file lists ``train_filenames``,
-``val_filenames`` or ``test_filenames``. Each view has the condition "time", a 0-dim float32 tensor, 0..1.
+There is either one ``transforms_SPLIT.json`` per split (z is up), or one ``transforms.json``. If both kinds of files
+exist, ``transforms.json`` is ignored. In a ``transforms.json``, every n-th image by name is a test view, unless the
+file lists ``train_filenames``, ``val_filenames`` or ``test_filenames``. Each view has the condition "time" (an input of
+the model), a 0-dim float32 tensor, 0..1.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ def load_moving_multiview(settings: Mapping[str, Any], context: SceneContext) ->
 def _read_timed_frames(
     options: MultiviewSettings, document: JsonReader, records: list[JsonReader], time_range: _TimeRange
 ) -> tuple[list[JsonReader], list[ImageFrame]]:
-    """Parse JSON records of frames; return those that are used, and their frames with the condition "time", 0..1.
+    """Return the JSON records of frames that are used, and the parsed frames with the condition "time", 0..1.
 
     ``time_range`` has the times in the file that become 0 and 1.
     """
@@ -171,11 +172,11 @@ def _is_time_range(value: str) -> bool:
 
 @dataclass(frozen=True)
 class MultiviewSettings(FolderSettings):
-    """Settings of the scene.
+    """Settings of ``scene=multiview``.
 
     Attributes:
         train_split, test_split: NAME of the split's file transforms_NAME.json.
-        test_every: n; of a single transforms.json, every n-th image in the order of names is held out.
+        test_every: n; if there is a single transforms.json, every n-th image in the order of names is held out.
         time_range: "LOW:HIGH", the times in the files that become 0 and 1; "auto" for the lowest and highest time.
     """
 
@@ -271,7 +272,7 @@ def _moving_hull_points(views: ViewSet, times: Tensor, count: int, generator: to
 def _choose_moments(times: Tensor) -> tuple[list[tuple[list[int], float]], bool]:
     """Return at most 64 moments, (indices of views, time), sorted by time, and whether each moment is a single time.
 
-    ``times`` (V,) are those of the views. If cameras do not share times, a moment is a run of four successive views.
+    ``times`` (V,) are the views' times. If cameras do not share times, a moment is a run of four successive views.
     """
     values = times.tolist()
     sharing = Counter(values)
@@ -290,7 +291,7 @@ def _choose_moments(times: Tensor) -> tuple[list[tuple[list[int], float]], bool]
 def _draw_moving_point_per_cell(points: Tensor, side: float, generator: torch.Generator) -> Tensor:
     """Return the indices of one random point per cubic cell of edge ``side``.
 
-    Static surfaces occur in the hulls of all moments; this selection removes the repetitions.
+    Static surfaces occur in the hulls of all moments. Selecting one point per cell removes these repetitions.
     """
     shuffled = torch.randperm(len(points), generator=generator)
     cells = ((points[shuffled] - points.min(0).values) / side).floor().long().numpy()

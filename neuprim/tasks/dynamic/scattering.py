@@ -24,7 +24,8 @@ from neuprim.core.settings import RenderSettings
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 
 SHINES = "shines"
-"""Name of a condition, 0 or 1: whether an image includes emission. Of several images to be summed, only one does."""
+"""Name of a condition, 0 or 1: whether an image includes emission. If images under several lights are summed, only one
+image includes emission."""
 
 MOST_OCTAVES = 8
 MOST_ANISOTROPY = 0.95
@@ -35,9 +36,10 @@ _Array = TypeVar("_Array", np.ndarray, Tensor)
 def octaves_of_light(transmittance: _Array, octaves: int, share: float) -> list[_Array]:
     """Return the octaves of the light that a point scatters, divided by the unoccluded light: share^o T^(1/2^o).
 
-    T is the transmittance to the light. The first octave is single scattering. Each further octave approximates light
-    that is scattered more often: it is weaker, and extinction weakens it half as much (Wrenninge et al. 2013, Oz: The
-    Great and Volumetric).
+    T is the transmittance to the light, and o = 0, 1, ... is the number of the octave. Octave 0 is single scattering.
+    Each further octave approximates light that is scattered more often: the light is weaker by the factor ``share``,
+    but only half of the previous octave's optical depth attenuates it (Wrenninge et al. 2013, Oz: The Great and
+    Volumetric).
     """
     found = [transmittance]
     for octave in range(1, octaves):
@@ -58,8 +60,8 @@ def scattered_light(transmittance: _Array, octaves: int, share: float) -> _Array
 def phase_factor(cosine: _Array, anisotropy: float) -> _Array:
     """Return 4 pi times the phase function of Henyey and Greenstein (1941): (1 - g^2) / (1 + g^2 - 2 g cosine)^(3/2).
 
-    The mean over all directions is 1. ``cosine`` is that of the angle by which light is deflected, -1 to 1;
-    g is ``anisotropy``: above 0, most light is scattered forward.
+    The mean over all directions is 1. ``cosine``, -1 to 1, is the cosine of the angle by which light is deflected. g is
+    ``anisotropy``: above 0, most light is scattered forward.
     """
     g = anisotropy
     return (1 - g * g) / (1 + g * g - 2 * g * cosine) ** 1.5
@@ -83,10 +85,10 @@ def light_smoke_by_environment(environment: Environment, count: int, facts: Mapp
 class ScatteringHarmonics(TimeHarmonics):
     """Colour field of emission (the colour of :class:`TimeHarmonics`) plus scattered light, S max(0, a) E/typical.
 
-    a (C,) is a parameter of each primitive: albedo times the scattering fraction of the extinction, divided by 4 pi. E
-    is the condition ``light_intensity``: the irradiance of the unoccluded light. S is the sum over o of the
-    :func:`octaves_of_light`, each times the :func:`phase_factor` for anisotropy/2^o. T is the model's transmittance
-    from the primitive's centre to the light, without gradient
+    The parameter a (C,) of each primitive is albedo times the scattering fraction of the extinction, divided by 4 pi. E
+    is the condition ``light_intensity``: the irradiance of the unoccluded light. S is the sum of the
+    :func:`octaves_of_light`; octave o is multiplied by the :func:`phase_factor` for anisotropy/2^o. The transmittance
+    in these functions is the model's, from the primitive's centre to the light, without gradient
     (:func:`~neuprim.core.render.light.shade_volume_by_light`).
 
     Args:

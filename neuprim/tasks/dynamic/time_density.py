@@ -1,16 +1,15 @@
 """Density field whose cosine neurons change in time.
 
 At a fixed time, the density is that of :mod:`neuprim.core.model.cosine`: a network of K neurons with phases b1, output
-weights w2 and offset b2, in an ellipsoid with centre mu. The setting ``time`` names the time-dependent parts, joined by
-"+":
+weights w2 and offset b2, in an ellipsoid with centre mu. xi is the time, 0..1 over the sequence. The setting ``time``
+names the time-dependent parts, joined by "+". W_t, p_j, q_j, c, tau, v and a are parameters of each primitive:
 
     phase    b1 + xi W_t                                        equation 13 of the paper; K parameters
     offset   b2 + sum_j p_j cos(pi j xi) + q_j sin(pi j xi)     j = 1..4; 8 parameters
     window   (w2, b2) (1 - u^2)^2, u = (xi - c)/tau, |u| < 1    active from c - tau to c + tau; 2 parameters
     motion   mu + v (xi - c) + a (xi - c)^2                     c of the window, else 1/2; 6 parameters
 
-xi is the time, 0..1 over the sequence. Primitives whose window does not contain xi are removed from a frame before
-anything else is computed.
+Primitives whose window does not contain xi are removed from a frame before anything else is computed.
 
 A model joined from chunks of a sequence stores the chunk number of every primitive. Neighbouring chunks overlap in
 time. During an overlap, the earlier chunk's weight falls linearly from 1 to 0, and the later one's rises from 0 to 1.
@@ -83,7 +82,8 @@ def time_chunk_weights(chunk: Tensor, overlaps: ChunkOverlaps, xi: Tensor) -> Te
     The weight is 1 during the primitive's time chunk, 0 outside, and changes linearly during overlaps of chunks.
 
     Args:
-        chunk: each primitive's chunk, 0 to len(overlaps), any dtype; rounded, as compression may change it slightly.
+        chunk: chunk number of each primitive, 0 to len(overlaps), any dtype. Numbers are rounded, because compression
+            may change them slightly.
     """
     numbers = chunk.detach().double().round()
     weights = torch.ones_like(numbers)
@@ -286,7 +286,7 @@ def _zero_time_parameters(width: int) -> Any:
 def _initial_time_window_center(ctx: InitContext) -> Tensor:
     """Return the (N, 1) initial centres of windows (spans of time in which primitives are active).
 
-    They are the times of the starting points or, without times, uniformly random in 0..1.
+    The centres are the times of the starting points or, if these have no times, uniformly random in 0..1.
     """
     if "time" in ctx.conditions:
         return ctx.conditions["time"].float().reshape(-1, 1)
@@ -296,7 +296,8 @@ def _initial_time_window_center(ctx: InitContext) -> Tensor:
 def _initial_log_time_window(ctx: InitContext) -> Tensor:
     """Return (N, 1) logarithms of the initial half widths of windows (spans of time in which primitives are active).
 
-    The setting ``window_frames`` limits half widths in frames: longer sequences contain more events, not longer ones.
+    The setting ``window_frames`` limits half widths in frames, because longer sequences contain more events, but not
+    longer events.
     """
     half = ctx.number("window", 0.2, 0)
     if ctx.settings.get("window_frames") is not None and "time" in ctx.steps:
@@ -313,10 +314,10 @@ _MIDDLE = 0.5  # reference time of motion without a window
 def drop_time_terms(params: Params, geometry: Geometry, part: str, omega0: float) -> dict[str, Tensor]:
     """Replace one time-dependent part of a :class:`TimeDensity` by its mean over time; return the new tensors.
 
-    Means are over xi in 0..1, weighted by the window if there is one. A cosine cos(phi + xi a), whose phase changes at
-    the rate a, is replaced by its mean R cos(phi + psi), where R e^(i psi) is the mean of e^(i xi a). A window is
-    replaced by its mean factor, a motion by the mean position, which changes "means". The result still contains the
-    tensors of the replaced part.
+    Means are over xi in 0..1, weighted by the window if there is a window. The phase of a cosine cos(phi + xi a)
+    changes at the rate a. The mean of this cosine is R cos(phi + psi), where R e^(i psi) is the mean of e^(i xi a). A
+    window is replaced by its mean factor. A motion is replaced by the mean position, which changes "means". The result
+    still contains the tensors of the replaced part.
     """
     if part == "phase":
         return {**params, **_mean_phase_over_time(params, omega0)}

@@ -69,7 +69,7 @@ def apply_time_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor
     """Return w2 (N, K) and b2 (N, 1), which scale the density, multiplied by the factor of a window in time.
 
     The factor is (1 - u^2)^2, or 0 if |u| > 1, with u = (xi - center)/exp(log_window). ``center`` and ``log_window``
-    are (N, 1); all have one dtype. The time ``xi`` () gets no gradient.
+    are (N, 1). All tensors of primitives have the same dtype. The time ``xi``, 0-dim, gets no gradient.
     """
     if not device.on_numba(w2, b2, center, log_window):
         weight = edge_weight(((xi.to(b2.dtype) - center) / log_window.exp()).square(), WINDOW_EDGE)
@@ -80,7 +80,10 @@ def apply_time_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor
 
 @exact_kernel
 def _move_in_time_backward(velocity, acceleration, since, pulled, g_velocity, g_acceleration, g_center):  # type: ignore[no-untyped-def]
-    """Fill the gradients ``g_...`` from ``pulled``, that of the moved centres; ``since`` (N, 1) is xi - center."""
+    """Write the gradients ``g_...`` from ``pulled``, the gradient of the moved centres.
+
+    ``since`` (N, 1) is xi - center.
+    """
     for n in range(since.shape[0]):
         total = 0.0
         for j in range(3):
@@ -109,7 +112,8 @@ class _MoveInTime(torch.autograd.Function):
 def move_means(means: Tensor, velocity: Tensor, acceleration: Tensor, center: Tensor, xi: Tensor) -> Tensor:
     """Return the (N, 3) centres at time ``xi``: means + velocity (xi - center) + acceleration (xi - center)^2.
 
-    ``center`` (N, 1) is the time at which a primitive is at ``means``; all have one dtype. ``xi`` () gets no gradient.
+    ``center`` (N, 1) is the time at which a primitive is at ``means``. All tensors of primitives have the same dtype.
+    ``xi``, 0-dim, gets no gradient.
     """
     if not device.on_numba(means, velocity, acceleration, center):
         since = xi.to(velocity.dtype) - center

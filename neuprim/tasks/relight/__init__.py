@@ -2,7 +2,8 @@
 
 Image values are linear light divided by the exposure; 1 is the brightest value of a display. Metrics clamp the values
 to 0..1, since a single highlight of 20 would dominate an image's error. Metrics with "linear_clamped" in the name
-compare the clamped values, those with "display" compare their sRGB values. The metric FLIP needs ``neuprim[flip]``.
+compare the clamped values. Metrics with "display" convert the clamped values to sRGB first. The metric FLIP needs
+``neuprim[flip]``.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def _check_relight_model(model: Mapping[str, Any]) -> None:
     for key in colour:
         if key != "form" and key not in _OF_FORM[form]:
             owners = " or ".join(name for name, own in _OF_FORM.items() if key in own)
-            expected = f"model.colour.form={owners}, or no such setting"
+            expected = f"model.colour.form={owners}, or no model.colour.{key}"
             raise ConfigError(f"model.colour.{key}={colour[key]}: not a setting of form={form}; expected {expected}")
     try:
         _light_colour_field(model)
@@ -82,7 +83,8 @@ def _tunable_relight_settings(model: Mapping[str, Any]) -> dict[str, tuple[Any, 
 def _build_relight_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
     if dataset.channels != 3:
         raise ConfigError(
-            f"{dataset.name}: {dataset.channels} colour channels; task relight expects 3, like light_intensity"
+            f"{dataset.name}: images have {dataset.channels} colour channels; "
+            "task relight expects 3, because lights are RGB"
         )
     falloff = dataset_lighting(dataset).falloff == "inverse_square"
     density = CosineDensity(model["neurons"], **model["density"])
@@ -195,7 +197,7 @@ def light_orbit(dataset: Dataset, frames: int) -> list[View]:
 def relight_scores(rendered: Tensor, truth: Tensor, structure: bool = True) -> dict[str, float]:
     """Return scores of an image after clamping to 0..1: the PSNR in linear light and in sRGB ("display").
 
-    With ``structure``, the result also has SSIM and, if it is installed, FLIP, both of sRGB values.
+    With ``structure``, the result also has SSIM and, if FLIP is installed, FLIP; both compare sRGB values.
     """
     first, second = rendered.clamp(0.0, 1.0), truth.clamp(0.0, 1.0)
     result = {"psnr_linear_clamped": psnr(first, second)}
@@ -216,8 +218,8 @@ def relight_pixel_class_errors(rendered: Tensor, truth: Tensor, classes: Tensor)
     """
     if classes.shape != truth.shape[:2] or int(classes.max()) >= len(PIXEL_CLASSES):
         raise DataError(
-            f"pixel classes: found {tuple(classes.shape)} with values up to {int(classes.max())}; "
-            f"expected {tuple(truth.shape[:2])} with values below {len(PIXEL_CLASSES)}"
+            f"pixel classes: the map has shape {tuple(classes.shape)} and values up to {int(classes.max())}; "
+            f"expected shape {tuple(truth.shape[:2])} and values below {len(PIXEL_CLASSES)}"
         )
     squares = (rendered.clamp(0.0, 1.0) - truth.clamp(0.0, 1.0)).double().square().mean(-1)
     result: dict[str, float] = {}

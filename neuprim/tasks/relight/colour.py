@@ -4,11 +4,12 @@
     additive         c = V E max(0, c_dc + W_out h)        equation 14: 9 -> H -> 3, 107 parameters at H = 8
     multiplicative   c = V E max(0, albedo (1 + w_out . h))    h does not change the hue: 91 parameters
 
-x~ is the middle of the ray's chord through the ellipsoid, relative to its centre, in units of its longest semi-axis. d
-and l are unit vectors: from the camera to the centre, and from the centre to the light. E is the strength of the light
-relative to a typical training light: the intensity, divided by the squared distance if the dataset's falloff is
-"inverse_square". V is the visibility of the light from the primitive (:mod:`neuprim.core.render.light`), or 1. All
-terms but W_x x~ are constant over a primitive. For each frame, the field is therefore converted to
+h are the H hidden units. The W, b, c_dc and albedo are parameters of each primitive; beta is a constant factor. x~ is
+the middle of the ray's chord through the ellipsoid, relative to the ellipsoid's centre, in units of the longest
+semi-axis. d and l are unit vectors: from the camera to the centre, and from the centre to the light. E is the strength
+of the light relative to a typical training light: the intensity, divided by the squared distance if the dataset's
+falloff is "inverse_square". V is the visibility of the light from the primitive (:mod:`neuprim.core.render.light`), or
+1. All terms but W_x x~ are constant over a primitive. For each frame, the field is therefore converted to
 :class:`~neuprim.core.model.forms.RayNet`, which the renderer evaluates per pixel.
 """
 
@@ -133,7 +134,7 @@ class LightNetwork(ColourField):
         return RayNet(self.boost * params["net_x"], self.boost * phase, out * factor[:, :, None], base * factor)
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
-        """Return the parameters of children, which replace split parents, so that they keep the parents' colour.
+        """Return the parameters of the children of split primitives, such that children have their parents' colour.
 
         A point at x~ in a parent (centre mu, longest semi-axis m) is at x~' = x~ m/m' - (mu' - mu)/m' in a child
         (centre mu', longest semi-axis m').
@@ -180,11 +181,11 @@ def prune_light_network_units(
 ) -> dict[str, Tensor]:
     """Prune a :class:`LightNetwork` to the ``keep`` hidden units per primitive that affect the colour most.
 
-    A removed unit is replaced by its mean over x~ in the ellipsoid and over all directions d and l, with the symbols of
-    the module and phi = beta b. The mean of cos(phi + beta (W_x x~ + W_d d + W_l l)) is cos(phi) B(|beta W_x A|)
-    sinc(|beta W_d|) sinc(|beta W_l|), where the columns of A are the semi-axes in the units of x~, and B is the mean of
-    a cosine over the unit ball. The variance follows from cos^2 = (1 + cos 2(.))/2. In the multiplicative form the mean
-    becomes part of the albedo.
+    A removed unit is replaced by its mean over x~ in the ellipsoid and over all directions d and l. Symbols are those
+    of the module; phi is beta b. The mean of cos(phi + beta (W_x x~ + W_d d + W_l l)) is cos(phi) B(|beta W_x A|)
+    sinc(|beta W_d|) sinc(|beta W_l|). The columns of A are the semi-axes in the units of x~. B is the mean of a cosine
+    over the unit ball. The variance follows from cos^2 = (1 + cos 2(.))/2. In the multiplicative form, the mean becomes
+    part of the albedo.
     """
     net_x, view, light = (params[name].double() * boost for name in ("net_x", "net_view", "net_light"))
     phase, out = boost * params["net_phase"].double(), params["net_out"].double()

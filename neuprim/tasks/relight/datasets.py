@@ -10,7 +10,8 @@ Keys of ``transforms_SPLIT.json``:
   machine, so the longest tail of ``img_path`` that exists is used.
 * in each frame, the pose: [R_opt^T | T_opt], world to camera with OpenCV axes, else ``transform_matrix``
 
-PNG and JPEG files contain sRGB with straight alpha and are converted to linear light. OpenEXR is linear, premultiplied.
+PNG and JPEG files contain sRGB with straight alpha and are converted to linear light. OpenEXR files contain linear
+light, premultiplied by alpha.
 """
 
 from __future__ import annotations
@@ -67,18 +68,19 @@ class OlatSettings(FolderSettings):
     # train_split, test_split: names in transforms_NAME.json
     train_split: SplitName = "train"
     test_split: SplitName = "test"
-    # n: evaluate on every n-th training view instead of the test split, for tuning; 0 for that split
+    # n: for tuning, evaluate on every n-th training view instead of the test split; 0: evaluate on the test split
     hold_out: HoldOut = 0
-    # "inverse_square" where the light weakens with the square of its distance; "auto": as training images show
+    # "inverse_square" if the light weakens with the square of its distance; "none" if it does not; "auto": measured
+    # from the training images
     falloff: Literal["auto", "none", "inverse_square"] = "auto"
-    # "camera": positions of lights are on the axes of each frame's camera, as of a flash: x right, y up, z backward
+    # "camera": positions of lights are in camera coordinates of each frame, as for a flash: x right, y up, z backward
     light_space: Literal["world", "camera"] = "world"
-    # what of the training views is known only roughly, and learned with the model: lights (with their intensities),
-    # cameras
+    # properties of the training views that are known only roughly, and therefore learned with the model: lights (with
+    # their intensities), cameras
     refine: list[Literal["light", "camera"]] = field(default_factory=list)
-    # images are divided by this, None by 1; "auto": by the 99.5th percentile of the training images
+    # divisor of the image values; None for 1; "auto" for the 99.5th percentile of the training images
     exposure: Annotated[float, Range(above=0)] | Literal["auto"] | None = None
-    ignore_corrections: bool = False  # poses are transform_matrix, even where a frame has the optimised R_opt and T_opt
+    ignore_corrections: bool = False  # read poses from transform_matrix, even if a frame has the optimised R_opt, T_opt
 
 
 def load_olat(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
@@ -145,7 +147,7 @@ def _olat_frame_name(record: JsonReader) -> str:
 
 
 def _find_olat_image(folder: Path, record: JsonReader) -> Path | None:
-    """Return the image file that ``record``, an entry of ``frames`` in the JSON file, names; None if it is missing."""
+    """Return the image file of ``record``, an entry of ``frames`` in the JSON file; None if the file is missing."""
     if record.has("img_path"):
         parts = record.text("img_path").replace("\\", "/").split("/")
         tails = (
@@ -189,7 +191,7 @@ def _olat_viewmat(record: JsonReader, ignore_corrections: bool) -> Tensor:
 
 
 def _light_intensity(source: JsonReader) -> Tensor:
-    """Return the light's RGB intensity, the JSON value ``pl_intensity``, as (3,) float32; ones if it is missing."""
+    """Return the light's RGB intensity, the JSON value ``pl_intensity``, as (3,) float32; (1, 1, 1) if missing."""
     expected = "3 numbers of at least 0, or one"
     if not source.has("pl_intensity"):
         return torch.ones(3)
@@ -212,11 +214,11 @@ class LitSolidsSettings(LitSettings):
     """Settings of ``scene=lit_solids``, for rendering the images and for reading them."""
 
     background: _Background = "black"  # "black", or "random": training composites random colours
-    hold_out: HoldOut = 0  # n: every n-th training view is the test split, for tuning; 0 for the split that is drawn
+    hold_out: HoldOut = 0  # n: for tuning, every n-th training view is a test view; 0: the rendered test split
 
 
 def load_lit_solids_for_relighting(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load the scene ``lit_solids``. The first use renders images to ``context.cache_dir``; later uses read them."""
+    """Load the scene ``lit_solids``, whose images are rendered to ``context.cache_dir`` on first use."""
     options = validate_settings(LitSolidsSettings, settings, "scene")
     drawn = LitSettings(**{f.name: getattr(options, f.name) for f in fields(LitSettings)})
     folder = generate_lit_solids(drawn, context.cache_dir, context.progress)
@@ -237,7 +239,7 @@ def load_lit_solids_for_relighting(settings: Mapping[str, Any], context: SceneCo
 def _lit_solids_olat_lighting(dataset: Dataset, folder: Path) -> Lighting:
     """Return the :class:`Lighting` of ``lit_solids``: functions that read pixel classes and two baseline images.
 
-    It also has the names of the parts of the test split, and a video clip in which the light circles.
+    The result also has the names of the parts of the test split, and a video clip in which the light circles.
     """
     names = {"no_cast_shadows": "unshadowed.exr", f"nearest_light_of_{NEAR_LIGHTS}": "nearest.exr"}
     baselines = {name: partial(_read_lit_companion_image, ending) for name, ending in names.items()}
@@ -258,10 +260,10 @@ def read_lit_pixel_classes(views: ViewSet, index: int) -> Tensor:
 
 
 def _read_lit_companion_image(ending: str, views: ViewSet, index: int) -> Tensor | None:
-    """Read a further (H, W, 3) image of a view, from its file VIEW_``ending``; None if the view has none.
+    """Read a baseline image (H, W, 3) of a view, from the file VIEW_``ending``; return None if there is no such file.
 
-    ``ending`` is "unshadowed.exr" or "nearest.exr", which training views do not have. Values are linear light divided
-    by the exposure.
+    ``ending`` is "unshadowed.exr" or "nearest.exr"; training views do not have these files. Values are linear light
+    divided by the exposure.
     """
     camera, path = views.view(index).camera, _lit_companion_path(views, ending, index)
     return read_image(path, (camera.width, camera.height))[..., :3].float() if path.is_file() else None

@@ -33,27 +33,31 @@ FALLOFF_SPREAD = 0.4  # largest standard error of a measured falloff exponent
 class Lighting:
     """Optional facts about a relighting dataset besides images, cameras and lights; stored in ``Dataset.extra``."""
 
-    # "inverse_square" if images darken with the square of the light's distance, so that a renderer divides by it;
-    # "none" if intensities are given as they arrive, or unknown
+    # "inverse_square" if images darken with the square of the light's distance; a renderer then divides the intensity
+    # by this square. "none" if the given intensities already include the falloff, or if the falloff is unknown
     falloff: Falloff = "none"
-    # (views, index) -> (H, W) uint8 pixel classes of a view, indices of :data:`~neuprim.scenes.PIXEL_CLASSES`; errors
-    # are then reported per class. The views may be a :class:`~neuprim.core.data.dataset.ViewSubset`
+    # function (views, index) -> (H, W) uint8 pixel classes of a view, which are indices into
+    # :data:`~neuprim.scenes.PIXEL_CLASSES`. With this function, errors are reported per class, too. The views may be a
+    # :class:`~neuprim.core.data.dataset.ViewSubset`
     classes: Callable[[ViewSet, int], Tensor] | None = None
-    # prefixes of names of test views that get scores of their own, e.g. those with a new light
+    # prefixes of view names; test views with the same prefix, e.g. "new_light", get separate scores
     parts: tuple[str, ...] = ()
-    # name -> function of (views, index) that gives (H, W, 3) linear light over the exposure, an image without a model,
-    # or None for views that have none; a black one is always included
+    # baseline name -> function (views, index) -> an image that was made without the model: (H, W, 3) linear light over
+    # the exposure, or None for views without such an image. A black baseline image is always included
     baselines: Mapping[str, Callable[[ViewSet, int], Tensor | None]] = field(default_factory=dict)
     clips: tuple[Clip, ...] = ()  # films besides the test views
 
 
 def dataset_lighting(dataset: Dataset) -> Lighting:
-    """Return ``dataset.extra``, or a default :class:`Lighting` if it is None; DatasetError if it has another type."""
+    """Return ``dataset.extra``, or a default :class:`Lighting` if ``extra`` is None.
+
+    Raises DatasetError if ``extra`` has another type.
+    """
     return get_extra(dataset, Lighting) or Lighting()
 
 
 def olat_percentile_exposure(views: ImageViews, where: str) -> float:
-    """Return the exposure, by which images are divided: the 99.5th percentile of their premultiplied values.
+    """Return the exposure, by which images are divided: the 99.5th percentile of the images' premultiplied values.
 
     Raises DataError if the percentile is 0; ``where`` names the data in the message.
     """
@@ -77,10 +81,11 @@ def olat_percentile_exposure(views: ImageViews, where: str) -> float:
 def measure_falloff(dataset: Dataset) -> Falloff:
     """Return "inverse_square" if training images darken with the light's distance, else "none".
 
-    The function fits log(mean value of a view / light intensity) by a linear combination of the logarithm of the
-    light's distance, harmonics up to degree 2 of the directions to light and camera, and the cosine between these
-    directions and its square. If the coefficient of the distance is at most -1, the result is "inverse_square", as for
-    a point light. If the images do not determine the coefficient, the result is the same, with a warning.
+    The function fits log(mean value of a view / light intensity) by a linear combination. Its terms are the logarithm
+    of the light's distance, spherical harmonics up to degree 2 of the directions to light and camera, and the cosine
+    between these directions and its square. If the coefficient of the distance is at most -1, the result is
+    "inverse_square", as for a point light. If the images do not determine the coefficient, the result is also
+    "inverse_square", with a warning.
     """
     center, views = dataset.center.double(), dataset.train
     rows, values = [], []

@@ -60,9 +60,12 @@ def surface_colors(
     Args:
         means: (N, 3) centres, scene units.
         sizes: (N,) sizes of the primitives, scene units.
-        normal: (N, 3), of any length. albedo: (N, C).
-        highlight: (N, L, C) colours of lobes, L from 0 to 8. log_gloss: (N, L) natural logarithms of their sharpness g.
-        indirect: (N, n, C), n one of :data:`INDIRECT`: b_0, then the columns of B for x, y and z.
+        normal: (N, 3) normals, of any length.
+        albedo: (N, C).
+        highlight: (N, L, C) colours of the highlight lobes, L from 0 to 8.
+        log_gloss: (N, L) natural logarithms of the lobes' sharpness g.
+        indirect: (N, n, C) coefficients of indirect light: b_0, then the columns of B for x, y and z. n is one of
+            :data:`INDIRECT`.
         light, eye: (3,) positions, scene units.
 
     Raises:

@@ -33,9 +33,9 @@ def _unit(x, y, z, shortest):  # type: ignore[no-untyped-def]
 
 @strict
 def _project_gradient(g, i, unit):  # type: ignore[no-untyped-def]
-    """Replace the gradient for a normalised vector by the gradient for the vector, in row i of ``g``.
+    """Convert row i of ``g`` in place: from the gradient of a normalised vector to the gradient of the original vector.
 
-    ``unit`` is the result of :func:`_unit` for the vector.
+    ``unit`` is the result of :func:`_unit` for the original vector.
     """
     x, y, z, over, whole = unit
     along = (g[i, 0] * x + g[i, 1] * y + g[i, 2] * z) * whole
@@ -44,9 +44,9 @@ def _project_gradient(g, i, unit):  # type: ignore[no-untyped-def]
 
 @strict
 def _directions(i, means, sizes, normal, light, eye):  # type: ignore[no-untyped-def]
-    """Return four unit vectors of primitive i, each as :func:`_unit` returns it.
+    """Return four results of :func:`_unit` for primitive i.
 
-    They are its normal, the directions to the light and to the camera, and the half vector of these directions.
+    These are the unit normal, the directions to the light and to the camera, and the half vector of these directions.
     """
     shortest = SHORTEST * np.float64(sizes[i])
     n = _unit(np.float64(normal[i, 0]), np.float64(normal[i, 1]), np.float64(normal[i, 2]), SHORTEST)
@@ -94,7 +94,7 @@ def _surface_colors_backward(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Write the gradients ``g_...`` of primitives start to stop, from ``grad`` (N, 2, C), the gradient of the colours.
 
-    ``g_light`` and ``g_eye`` (N, 3) are for the vectors from each primitive to the light and to the camera.
+    ``g_light`` and ``g_eye`` (N, 3) are gradients with respect to the vectors from each primitive to light and camera.
     """
     lobes, numbers, channels = log_gloss.shape[1], indirect.shape[1], albedo.shape[1]
     g_l = np.empty(3)

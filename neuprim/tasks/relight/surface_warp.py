@@ -51,7 +51,10 @@ def _forward(
     albedo: wp.array2d(dtype=float), highlight: wp.array3d(dtype=float), log_gloss: wp.array2d(dtype=float),
     indirect: wp.array3d(dtype=float), places: wp.array(dtype=wp.vec3d), color: wp.array3d(dtype=float),
 ):  # fmt: skip
-    """Write direct colours to ``color[i, 0]``, indirect ones to ``color[i, 1]``; ``places``: light and eye."""
+    """Write the direct colour of primitive i to ``color[i, 0]``, and the indirect colour to ``color[i, 1]``.
+
+    ``places`` has the positions of the light and of the camera.
+    """
     i = wp.tid()
     shortest = _SHORTEST * d(sizes[i])
     n, l, v = wp.vec3d(normal[i]), places[0] - wp.vec3d(means[i]), places[1] - wp.vec3d(means[i])
@@ -82,7 +85,10 @@ def _backward(
     g_places: wp.array2d(dtype=wp.vec3d), g_normal: wp.array(dtype=wp.vec3), g_albedo: wp.array2d(dtype=float),
     g_highlight: wp.array3d(dtype=float), g_log_gloss: wp.array2d(dtype=float), g_indirect: wp.array3d(dtype=float),
 ):  # fmt: skip
-    """Write gradients of :func:`_forward` from ``grad``; ``g_places[i]`` are those of the offsets to light and eye."""
+    """Write the gradients ``g_...`` of the arguments of :func:`_forward`, from ``grad``, the gradient of the colours.
+
+    ``g_places[i]`` has gradients with respect to the vectors from primitive i to the light and to the camera.
+    """
     i = wp.tid()
     shortest = _SHORTEST * d(sizes[i])
     own, to_light, to_eye = wp.vec3d(normal[i]), places[0] - wp.vec3d(means[i]), places[1] - wp.vec3d(means[i])
@@ -169,8 +175,8 @@ class _SurfaceColors(torch.autograd.Function):
 def fused_surface_colors(*tensors: Tensor) -> Tensor:
     """Compute :func:`~neuprim.tasks.relight.surface.surface_colors` on the GPU; differentiable.
 
-    The arguments are those of that function, in its order; all but light and eye are float32 CUDA tensors. There must
-    be at least one lobe and one coefficient of indirect light.
+    The arguments are those of ``surface_colors``, in the same order. All tensors but ``light`` and ``eye`` are float32
+    CUDA tensors. There must be at least one lobe and one coefficient of indirect light.
     """
     result: Tensor = _SurfaceColors.apply(*tensors)
     return result

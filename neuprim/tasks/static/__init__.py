@@ -37,8 +37,8 @@ def _check_static_task_model(model: Mapping[str, Any]) -> None:
     validate_choices(model["density"], "model.density", {"form": ("cosine", "gaussian"), **DENSITY_OPTIONS})
     others = [key for key in model["density"] if key != "form"]
     if model["density"].get("form") == "gaussian" and others:
-        expected = "no such setting with model.density.form=gaussian"
-        raise ConfigError(f"model.density.{others[0]}: belongs to model.density.form=cosine; expected {expected}")
+        expected = f"this form, or no model.density.{others[0]}"
+        raise ConfigError(f"model.density.{others[0]}: used only with model.density.form=cosine; expected {expected}")
     _check_colour_settings(model["colour"], model["sh_degree"])
 
 
@@ -56,7 +56,10 @@ def _check_colour_settings(colour: Mapping[str, Any], degree: int) -> None:
     except ValueError as error:
         raise ConfigError(f"model.colour.lobes={colour['lobes']}: {error}") from error
     if degree != ModelSettings.sh_degree:
-        raise ConfigError(f"model.sh_degree={degree}: lobes have no spherical harmonics; expected model.colour.form=sh")
+        raise ConfigError(
+            f"model.sh_degree={degree}: not used with model.colour.form=lobes; "
+            "expected model.colour.form=sh, or no model.sh_degree"
+        )
 
 
 def _tunable_static_settings(model: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
@@ -67,13 +70,13 @@ def _tunable_static_settings(model: Mapping[str, Any]) -> dict[str, tuple[int, .
 
 
 def _load_static_scene(module: str, function: str, settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load a scene by ``function`` of the submodule ``module``, imported only now: it may need an optional library."""
+    """Load a scene by ``function`` of ``module``, imported on first use because it may need an optional library."""
     loader: Callable[..., Dataset] = getattr(import_module(f"neuprim.tasks.static.{module}"), function)
     return loader(settings, context)
 
 
 def _static_dataset_facts(dataset: Dataset) -> Mapping[str, Any]:
-    """Return facts about ``scene=mesh`` for a model's header: file name, ``scene_from_file`` matrix; else empty."""
+    """Return facts for a model's header: name and ``scene_from_file`` matrix of a mesh file; {} for other scenes."""
     return dataset.extra if isinstance(dataset.extra, dict) else {}
 
 

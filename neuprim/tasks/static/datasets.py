@@ -63,7 +63,7 @@ class BlenderSettings(FolderSettings):
     # train_split, test_split: NAME in transforms_NAME.json
     train_split: SplitName = "train"
     test_split: SplitName = "test"
-    # n: every n-th training view is the test split, and the real one stays unread; 0 for the real one
+    # n: every n-th training view becomes a test view, and the real test split is not read; 0: the real test split
     hold_out: HoldOut = 0
 
 
@@ -92,7 +92,7 @@ class NerfstudioSettings(FolderSettings):
     """Settings of ``scene=nerfstudio``."""
 
     skip_missing: bool = False  # leave out frames whose image is missing; otherwise they are an error
-    test_every: EveryNth = 8  # every n-th frame by name is a test view, where the file has no lists of names
+    test_every: EveryNth = 8  # every n-th frame by name is a test view, unless the file lists the names of the splits
 
 
 def load_nerfstudio(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
@@ -118,9 +118,9 @@ def load_nerfstudio(settings: Mapping[str, Any], context: SceneContext) -> Datas
 class ColmapSettings(FolderSettings):
     """Settings of ``scene=colmap``."""
 
-    # folder of the images; of reduced copies (``images_4``) the cameras are scaled to the files
+    # folder of the images; cameras are scaled to the size of reduced images, such as those in ``images_4``
     images: Annotated[str, nonempty_text("the image folder's name, e.g. images_4")] = "images"
-    # folder of the reconstruction; "auto" for the model in ``sparse`` with most posed images
+    # folder of the reconstruction; "auto" for the reconstruction in ``sparse`` with most posed images
     model: Annotated[str, nonempty_text("the model's folder, or auto")] = "auto"
     test_every: EveryNth = 8  # every n-th image by name, from the first, is a test view
     skip_missing: bool = False  # leave out images that are missing; otherwise they are an error
@@ -199,7 +199,8 @@ def _colmap_dataset_camera(where: str, image: Any, viewmat: Tensor, file: Path, 
     lens = image.camera
     size = f"{lens.width}x{lens.height}"
     if lens.width <= 0 or lens.height <= 0 or not np.isfinite(lens.params).all():
-        raise DataError(f"{where}: size {size}, parameters {lens.params}; expected a positive size and finite numbers")
+        found = f"image size is {size} and parameters are {lens.params}"
+        raise DataError(f"{where}: {found}; expected a positive size and finite parameters")
     if not is_resized_camera_size((lens.width, lens.height), (info.width, info.height)):
         expected = f"{size} ({where}) or a reduction of it{exif_hint(info)}"
         raise DataError(f"{file}: image is {info.width}x{info.height}; expected {expected}")
@@ -246,13 +247,13 @@ def _read_colmap_dataset_points(reconstruction: Any, model: Path) -> PointCloud 
 
 
 def load_solids_dataset(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load the built-in scene ``solids``. The first use renders images to ``context.cache_dir``; others read them."""
+    """Load the built-in scene ``solids``, whose images are rendered to ``context.cache_dir`` on first use."""
     folder = generate_solids(validate_settings(SolidsSettings, settings, "scene"), context.cache_dir, context.progress)
     return replace(load_blender({"path": str(folder)}, context), name="solids", data_source="generated")
 
 
 def load_room_dataset(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load the built-in scene ``room``. The first use renders images to ``context.cache_dir``; others read them."""
+    """Load the built-in scene ``room``, whose images are rendered to ``context.cache_dir`` on first use."""
     folder = generate_room(validate_settings(RoomSettings, settings, "scene"), context.cache_dir, context.progress)
     dataset = load_nerfstudio({"path": str(folder)}, context)
     return replace(dataset, name="room", data_source="generated", up=torch.tensor([0.0, 0.0, 1.0]))

@@ -71,7 +71,7 @@ def changed(row: int, column: int, value: float) -> Tensor:
     ("bad", "words"),
     [
         (replace(camera(), fx=0.0), "fx=0.0"),
-        (replace(camera(), fy=-1.0), "focal lengths > 0"),
+        (replace(camera(), fy=-1.0), "focal lengths above 0"),
         (replace(camera(), cx=float("nan")), "cx=nan"),
         (replace(camera(), fx=float("inf")), "fx=inf"),
         (replace(camera(), width=0), "0x30"),

@@ -132,7 +132,7 @@ def test_missing_sizes_endless_ranges_and_files_of_another_kind(tmp_path: Path) 
     path = tmp_path / "a b.usda"
     refused(usd(path), r"states no image size .* give --size WxH", None)
     for head in RANGES:
-        refused(usd(path, MOVING, head), "expected 1 to 100000 time codes")
+        refused(usd(path, MOVING, head), "expected a range of 1 to 100000 time codes")
     for data in (b"PXR-USDC" + bytes(range(256)) * 9, b"#usda 1.0\n("):
         path.write_bytes(data)
         refused(path, "not a readable USD file")

@@ -104,7 +104,7 @@ def test_a_staged_folder_joins_an_existing_one(tmp_path: Path, overwrite: bool) 
         for name in ("0", "deep/1", "deep/2"):
             (output.out / name).write_text("new")
         if not overwrite:
-            with pytest.raises(ConfigError, match=r"frames/0: exists; --force replaces it"):
+            with pytest.raises(ConfigError, match=r"frames/0: already exists; pass --force to replace it"):
                 output.publish()
             assert {k: v for k, v in tree(tmp_path).items() if k in before} == before
         else:
@@ -118,7 +118,7 @@ def test_what_is_in_the_way_of_staged_output_stays(tmp_path: Path, name: str, fo
     (tmp_path / "folder").mkdir()
     for file in ("file", "taken", "companion"):
         (tmp_path / file).write_text("old")
-    with pytest.raises(ConfigError, match=r"companion: exists|is a folder|is a file"):
+    with pytest.raises(ConfigError, match=r"companion: already exists|is a folder|is a file"):
         with staged_output(tmp_path / (name if name != "taken" else "new"), name != "taken") as output:
             if folder:
                 output.out.mkdir()

@@ -109,7 +109,7 @@ ONE = HEAD.format("ascii", 1)
         ("ply\nformat ascii 1.0\nend_header\n", "no element vertex"),
         (ONE.replace("float x", "list uchar x"), "as 'property float x' or"),
         (ONE.replace("float x", "list float int x"), "as 'property float x' or"),
-        (ONE.replace("float x", "list uchar int x") + "3 1 2\n", "a list of 3 numbers, in a line of 3"),
+        (ONE.replace("float x", "list uchar int x") + "3 1 2\n", "a list claims 3 numbers, but its line has only 3"),
         ("ply\nformat ascii 1.0\nelement a 1\nelement a 1\n", "element a twice"),
         (ONE.replace("float x", "float x\nproperty float x"), "twice"),
         (ONE.replace("float", "uchar") + "256\n", "outside the range of its type"),

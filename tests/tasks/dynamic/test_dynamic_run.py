@@ -178,7 +178,7 @@ def test_exports_and_inspections_take_frame_numbers(finished: Path, tmp_path: Pa
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--frame", "1-5"], "--frame 1-5: the sequence has frames 1 to 4"),
+        (["--frame", "1-5"], "--frame 1-5: not in the sequence; expected frames from 1 to 4"),
         (["--frame", "4-1"], "--frame 4-1: expected numbers and ranges such as 1001-1048x2,1060"),
         (["--frame", "1-4x0"], "expected numbers and ranges"),
         (["--frame", "a"], "expected numbers and ranges"),

@@ -185,7 +185,7 @@ def test_models_with_rigs_of_two_cameras(tmp_path: Path, pycolmap: Any) -> None:
 @pytest.mark.parametrize(
     ("params", "words"),
     [
-        ([0.0, 66.0, 29.3, 27.1], ["fx=0.0", "focal lengths > 0"]),
+        ([0.0, 66.0, 29.3, 27.1], ["fx=0.0", "focal lengths above 0"]),
         ([60.0, -66.0, 29.3, 27.1], ["fy=-66.0"]),
         ([60.0, 66.0, float("nan"), 27.1], ["nan", "finite"]),
     ],

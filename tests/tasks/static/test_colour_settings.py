@@ -30,7 +30,7 @@ def test_forms() -> None:
         (["preset=paper", "model.colour.lobes=2"], "model.colour.lobes=2: used only with model.colour.form="),
         (
             ["model.colour.form=lobes", "model.sh_degree=1"],
-            "model.sh_degree=1: lobes have no spherical harmonics; expected",
+            "model.sh_degree=1: not used with model.colour.form=lobes; expected",
         ),
         (["model.colour.form=lobes", "model.colour.lobes=9"], "model.colour.lobes=9: 9 lobes; expected 0..8"),
         (["model.colour.form=lobes", "model.colour.lobes=1.5"], "model.colour.lobes=1.5: expected a whole number"),

@@ -101,11 +101,11 @@ def test_a_header_that_says_a_billion_takes_no_memory(tmp_path: Path) -> None:
         "a.ply": "1000000000 vertices; expected at most 6000000",
         "b.ply": "1000000000 faces; expected at most 2000000",
         "c.ply": "expected a complete file",
-        "d.stl": "the header states 1000000000 faces; expected 50000000084 bytes, found 584",
-        "e.gltf": "bytes, its view has 36",
+        "d.stl": "the header states 1000000000 faces; expected 50000000084 bytes for them, but the file has 584",
+        "e.gltf": "bytes, but its view has 36",
         "f.gltf": "accessors[0] is sparse or compressed",
-        "g.gltf": "buffers[0] has 44 bytes, its byteLength is 1000000000",
-        "h.glb": "the file has 24 bytes, its header states 4294967295",
+        "g.gltf": "buffers[0] has 44 bytes, but its byteLength is 1000000000",
+        "h.glb": "the file has 24 bytes, but its header states 4294967295",
     }
     tracemalloc.start()
     for name, text in expected.items():
@@ -272,9 +272,9 @@ DAMAGED: dict[str, dict[str, Any]] = {
     "version 1.0": {"asset": {"version": "1.0"}},
     "key 'version' is missing": {"asset": {}},
     "needs the glTF extension KHR_draco_mesh_compression": {"extensionsRequired": ["KHR_draco_mesh_compression"]},
-    "bufferViews[0] ends at byte 100 of 44": {"bufferViews": [{"buffer": 0, "byteLength": 100}]},
+    "bufferViews[0] ends at byte 100, but its buffer has 44 bytes": {"bufferViews": [{"buffer": 0, "byteLength": 100}]},
     "list index out of range": {"bufferViews": []},
-    "an index is -1": {"nodes": [{"mesh": -1}]},
+    "an index or count is -1": {"nodes": [{"mesh": -1}]},
     "nodes[0] has a transform with a wrong number of values": {"nodes": [{"mesh": 0, "matrix": [1, 2, 3]}]},
     "could not convert": {"nodes": [{"mesh": 0, "scale": [1, 2, "x"]}]},
     "a number is inf": {"nodes": [{"mesh": 0, "scale": [1, 2, 1e999]}]},

@@ -375,7 +375,7 @@ def test_instances_are_expanded_below_their_node(tmp_path: Path, kind: str) -> N
     )
     np.testing.assert_allclose(second[0], [[-2, 38, 5], [2, 38, 5], [2, 42, 5]], atol=1e-6)
     document.json["accessors"][attributes["SCALE"]]["count"] = 1
-    with pytest.raises(DataError, match=r"instance attributes have \[1, 2\] values"):
+    with pytest.raises(DataError, match=r"attributes of instances have different or no lengths: \[1, 2\] values"):
         parts_of(document.write())
 
 

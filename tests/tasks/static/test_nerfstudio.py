@@ -209,7 +209,7 @@ def test_turned_photographs(capture: Any, scenes: Any, context: Any) -> None:
     edit(path, lambda d: [f.update(file_path=f["file_path"].replace("png", "jpg")) for f in d["frames"]])
     assert worst(scenes, load({"path": path}, context)) < 0.1, "the stated size is that of the stored pixels"
     edit(path, lambda d: d.update(w=H, h=W))
-    scenes.refused(load, {"path": path}, context, "image is 64x50; expected 50x64", "EXIF orientation is 6")
+    scenes.refused(load, {"path": path}, context, "image is 64x50; expected 50x64", "EXIF orientation 6 rotates")
 
 
 def test_upper_and_lower_case(capture: Any, context: Any) -> None:
@@ -261,7 +261,7 @@ def test_a_transparent_view_among_others_is_left_out(capture: Any, scenes: Any, 
         spot = np.array(Image.open(path / "images" / f"{i:02d}.png"))[..., :1]
         alpha = np.where(spot > 20, 255, 0).astype(np.uint8) * (i != 3)
         Image.fromarray(np.concatenate([spot, spot, spot, alpha], axis=-1)).save(path / "images" / f"{i:02d}.png")
-    with pytest.warns(NeuprimWarning, match=r"03.png: image is transparent everywhere.*; view 03 is left out"):
+    with pytest.warns(NeuprimWarning, match=r"03.png: image is fully transparent.*; view 03 is left out"):
         data = load({"path": path}, context)
     assert "03" not in names(data.train) and len(data.initial_points(10, torch.Generator().manual_seed(0)).means) == 10
 

@@ -25,8 +25,8 @@ Bounds = tuple[tuple[int, int, int], tuple[int, int, int]]
 class VdbTiles:
     """T constant tiles of a sparse volume: cubes in which all voxels have the same value."""
 
-    origins: np.ndarray  # (T, 3) int32, the lowest index of each
-    sizes: np.ndarray  # (T,) int32, edges in voxels, each one of TILE_SIZES
+    origins: np.ndarray  # (T, 3) int32, the lowest voxel index of each tile
+    sizes: np.ndarray  # (T,) int32, edge lengths in voxels, all in TILE_SIZES
     values: np.ndarray  # (T,) or (T, 3) float32
     active: np.ndarray  # (T,) bool
 
@@ -70,8 +70,8 @@ class VdbGrid:
     origins: np.ndarray  # (L, 3) int32, the lowest index of each leaf, multiples of 8, all different
     values: np.ndarray  # (L, 8, 8, 8) or (L, 8, 8, 8, 3) float32, indexed x, y, z
     masks: np.ndarray  # (L, 8, 8, 8) bool, which voxels are active
-    tiles: VdbTiles  # none of them overlaps a leaf
-    kind: str = "fog volume"  # or "staggered", "unknown" or, if asked for, "level set"
+    tiles: VdbTiles  # constant tiles; no tile overlaps a leaf
+    kind: str = "fog volume"  # "fog volume", "staggered", "unknown" or, if level sets are read, "level set"
     half: bool = False  # store as 16-bit floats when written
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
@@ -125,7 +125,7 @@ class VdbGrid:
         )
 
     def fog(self) -> VdbGrid:
-        """Convert a level set to a fog volume: 0 at and outside the surface, rising to 1 at the depth ``background``.
+        """Convert a level set to a fog volume: 0 at and outside the surface, 1 at the depth ``background`` and deeper.
 
         Depths are distances inside the surface, in world units; the value is linear in depth, as OpenVDB's
         ``sdfToFogVolume`` makes it. NaN becomes 0. Raises DataError if the background is not a positive number.
@@ -223,7 +223,7 @@ class VdbGrid:
         Args:
             bounds: the box, in voxel indices; None for :attr:`bounds` (an empty array if no voxel is active).
             max_bytes: memory limit for the box and up to 7 more voxels on each side; DataError beyond.
-            non_finite: value that replaces NaN and infinity; None keeps them.
+            non_finite: value that replaces NaN and infinity; None keeps NaN and infinity.
         """
         box = self.bounds if bounds is None else bounds
         channels = (3,) if self.channels == 3 else ()

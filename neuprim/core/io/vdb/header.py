@@ -82,7 +82,7 @@ def vdb_compression_label(flags: int) -> str:
 
 
 def blosc_module() -> Any:
-    """Import the package ``blosc``, set to one thread: starting threads for every leaf of 2 KB is slow."""
+    """Import the package ``blosc``, limited to one thread, because starting threads for every leaf of 2 KB is slow."""
     try:
         import blosc
     except ImportError as error:
@@ -93,9 +93,10 @@ def blosc_module() -> Any:
 
 
 def vdb_decompressor(flags: int) -> Callable[[bytes, int], bytes]:
-    """Return a function (chunk, size) -> ``size`` bytes, which decompresses data of a grid with these ``flags``.
+    """Return a function (chunk, size) -> ``size`` bytes, which decompresses data of a grid with compression ``flags``.
 
-    The function raises ValueError for a damaged chunk or another size. Without the Blosc bit, it decompresses zip.
+    The function decompresses Blosc if ``flags`` has the Blosc bit, else zip. It raises ValueError for a damaged chunk
+    or another size.
     """
     if not flags & BLOSC:
         return _unzip_vdb_chunk
@@ -108,7 +109,7 @@ def vdb_decompressor(flags: int) -> Callable[[bytes, int], bytes]:
         claimed, length = sizes(chunk)
         if claimed != size or length != len(chunk):  # also what keeps the library from allocating gigabytes
             raise ValueError(
-                f"a Blosc chunk says {length} bytes hold {claimed}; expected {len(chunk)} bytes that hold {size}"
+                f"a Blosc chunk states that {length} bytes unpack to {claimed}; expected {len(chunk)} to {size}"
             )
         if not size:
             return b""
@@ -157,14 +158,14 @@ _METADATA = {
 class GridHeader:
     """Header of one grid of an OpenVDB file."""
 
-    name: str  # unique in its file: further grids of one name get [1], [2], ... as in OpenVDB
+    name: str  # unique in the file: further grids with the same name get [1], [2], ... as in OpenVDB
     type: str  # OpenVDB's tree type, without the suffix for half floats
     half: bool  # whether values are stored as 16-bit floats
     flags: int  # compression bits
-    metadata: Mapping[str, Any]  # values of types not known here are bytes
+    metadata: Mapping[str, Any]  # name -> value; values of unknown types stay bytes
     map: str  # name of the transform's class
     transform: np.ndarray | None  # (4, 4) float64, index to world, acting on column vectors; None if unknown
-    parent: str  # the grid whose tree this one shares; empty for nearly all
+    parent: str  # name of the grid whose tree this grid shares; empty for nearly all grids
     tree_at: int  # byte offset of the tree
     block: int  # byte offset of the leaf buffers
     end: int  # byte offset of the first byte after the grid
@@ -182,7 +183,7 @@ class GridHeader:
 
     @property
     def number(self) -> np.dtype[Any]:
-        """Type of numbers that are not stored as 16-bit floats."""
+        """Type of the tree's numbers, float32 or float64, where these are not stored as 16-bit floats."""
         return np.dtype("<f8" if self.type in _DOUBLE_TREES else "<f4")
 
     @property
@@ -240,7 +241,7 @@ def read_header(path: Path) -> FileHeader:
 
 
 def parse_header(cursor: VdbCursor) -> FileHeader:
-    """Like :func:`read_header`, for an open file whose cursor is at the start."""
+    """Return the header of an open file, whose cursor is at the start; see :func:`read_header`."""
     if cursor.end < 8 or cursor.unpack("q", "the magic number") != (MAGIC,):
         expected = f"{MAGIC.to_bytes(8, 'little').hex(' ')} (an OpenVDB file)"
         raise cursor.fail(f"starts with {cursor.data[:8].hex(' ')}; expected {expected}")

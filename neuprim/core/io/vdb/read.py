@@ -82,11 +82,11 @@ def _decode_grid(cursor: VdbCursor, file: FileHeader, header: GridHeader, max_by
 # ---------------------------------------------------------------- trees
 
 ALL_VALUES = 6
-"""Value code of a node that stores the values of all its voxels. Other codes: only active values are stored.
+"""Value code of a node that stores the values of all its voxels. With the codes 0 to 5, only active values are stored.
 
-These codes say what the inactive values are. 0: the background; 1: minus the background; 2: one stored value; 3: the
+The codes 0 to 5 define the inactive values. 0: the background; 1: minus the background; 2: one stored value; 3: the
 background or its negative; 4: the background or a stored value; 5: one of two stored values. For 3 to 5, a mask chooses
-per voxel.
+between the two values per voxel.
 """
 
 _CHUNK = 1024  # leaves decoded together: 2 MB of float32, which stay in a core's cache
@@ -110,7 +110,10 @@ UPPER, LOWER = NodeSlots(5, 128), NodeSlots(4, 8)
 
 
 class _TreeReader:
-    """Decoder of a grid's tree into the arrays of a VdbGrid, at most ``max_bytes``; errors name the grid ``what``."""
+    """Decoder of a grid's tree to the arrays of a VdbGrid, at most ``max_bytes`` in total.
+
+    Errors name the grid ``what``.
+    """
 
     def __init__(self, file: VdbCursor, source: GridHeader, what: str, max_bytes: int) -> None:
         self._buffers = VdbCursor(file.path, file.data, source.block, source.end)
@@ -209,7 +212,8 @@ class _TreeReader:
     def _values(self, active: np.ndarray, count: int, what: str) -> np.ndarray | None:
         """Read the values of a node's ``count`` slots, (count,) or (count, 3) float32.
 
-        ``active`` is the (count,) mask of active slots. Returns None if all are inactive and have the background value.
+        ``active`` is the (count,) mask of active slots. Returns None if all slots are inactive and have the background
+        value.
         """
         cursor = self._cursor
         code, low, high, chosen = self._inactive(cursor, count, what)
@@ -228,10 +232,10 @@ class _TreeReader:
         return values
 
     def _inactive(self, cursor: VdbCursor, count: int, what: str) -> tuple[int, np.ndarray, np.ndarray, bytes | None]:
-        """Read the value code of a node (see ALL_VALUES) and what describes its inactive values.
+        """Read the value code of a node (see ALL_VALUES) and the data that define its inactive values.
 
-        Returns the code, two inactive values, and the mask of the voxels with the second value, or None if all have the
-        first.
+        Returns the code, two inactive values, and the mask of the voxels with the second value. The mask is None if all
+        inactive voxels have the first value.
         """
         code = cursor.take(1, f"value code of {what}")[0]
         if code > ALL_VALUES:
@@ -296,8 +300,9 @@ class _TreeReader:
     ) -> tuple[bytes, list[tuple[int, Any, Any, bytes | None]], list[int], bytes]:
         """Read and decompress the bytes of leaves ``first`` to ``last`` - 1.
 
-        Returns their masks, the leaves whose inactive values are not the background (index, two values, mask of the
-        second or None), the indices of leaves that store all values, and the stored values. Indices start at ``first``.
+        Returns the leaves' masks; a list of the leaves whose inactive values are not the background, as (index, two
+        values, mask of the second value or None); the indices of leaves that store all values; and the stored values.
+        Indices are relative to ``first``.
         """
         cursor, what = self._buffers, f"a leaf of {self._what}"
         data, unpack, size_at = cursor.data, self._unpack, struct.Struct("<q").unpack_from
@@ -343,7 +348,7 @@ class _TreeReader:
 
 
 def _to_float32(values: np.ndarray) -> np.ndarray:
-    """Convert to float32; doubles beyond its range become infinite, which :attr:`VdbGrid.non_finite` counts."""
+    """Convert to float32. Doubles beyond float32's range become infinite; :attr:`VdbGrid.non_finite` counts these."""
     with np.errstate(over="ignore"):
         return values.astype(np.float32, copy=False)
 
@@ -366,7 +371,7 @@ class VdbSequence:
 
     folder: Path
     frames: tuple[VdbFrame, ...]  # one or more
-    gaps: tuple[tuple[int, int], ...]  # first and last of each series of missing numbers
+    gaps: tuple[tuple[int, int], ...]  # first and last number of each series of missing frames
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -426,7 +431,10 @@ def list_vdb_files(path: Path) -> VdbSequence:
 
 
 def _split_frame_number(name: str) -> tuple[str, int] | None:
-    """Split a file name into its sequence's name (without suffix and number) and its last number; None without one."""
+    """Split a file name into the sequence's name (without suffix and number) and the last number.
+
+    The result is None if the file name has no number.
+    """
     match = re.fullmatch(r"(.*?)([0-9]+)([^0-9]*)", Path(name).stem, re.DOTALL)
     if match is None or len(match[2]) > 18:
         return None

@@ -32,7 +32,7 @@ def write_vdb(
     """Write grids to an OpenVDB file, atomically.
 
     Args:
-        grids: one or more grids with different names; those with ``half`` are rounded to 16-bit floats.
+        grids: one or more grids with different names; values of grids with ``half`` are rounded to 16-bit floats.
         compression: "none", "zip" or "blosc".
         metadata: metadata of the file by name; values are str, bool, int, float, or three ints or floats.
 
@@ -251,7 +251,7 @@ def _group_by_block(
 ) -> list[tuple[tuple[int, int, int], tuple[np.ndarray, np.ndarray]]]:
     """Group leaves and tiles, given by their lowest voxel indices (N, 3), by aligned cubes of edge ``size`` voxels.
 
-    Returns (lowest corner, (leaf indices, tile indices)) for each cube that has any.
+    Returns (lowest corner, (leaf indices, tile indices)) for each cube that contains a leaf or tile.
     """
     corners, inverse = np.unique(np.concatenate([leaves, tiles]) // size * size, axis=0, return_inverse=True)
     order, count = np.argsort(inverse, kind="stable"), len(leaves)
@@ -271,9 +271,10 @@ def _vdb_slot_numbers(corners: np.ndarray, origin: tuple[int, int, int], slots: 
 
 
 def _value_packer(flags: int, unit: int) -> Callable[[bytes], bytes]:
-    """Return a function that compresses the bytes of a node's values, of ``unit`` bytes each, as ``flags`` say.
+    """Return a function that compresses the bytes of a node's values, by the compression bits ``flags``.
 
-    The function puts the length in front of compressed values, and minus the length if they did not get smaller.
+    A value has ``unit`` bytes. The function puts the length in front of the compressed bytes. If compression does not
+    make the bytes smaller, the result is minus the length, then the uncompressed bytes.
     """
     if not flags & (ZIP | BLOSC):
         return lambda raw: raw

@@ -54,14 +54,14 @@ class _PreparedFrame:
     """The data of one frame that both the forward and the backward pass use."""
 
     request: RasterRequest
-    tensors: dict[str, Array]  # parameters, and weights of colour networks, by name, all of one dtype
+    tensors: dict[str, Array]  # parameters and weights of colour networks by name; all have the same dtype
     view: View
     projected: Projected
     arrays: FrameArrays
     lists: TileLists
     net: ColourNet | None
-    tiles: int  # per image
-    chunk: int  # tiles per unit of work
+    tiles: int  # number of tiles per image
+    chunk: int  # number of tiles per unit of work
 
     @property
     def parameters(self) -> PrimitiveArrays:
@@ -73,7 +73,10 @@ def _cpu_array(tensor: Tensor) -> Array:
 
 
 def _rasterizer_arrays_by_name(tensors: Sequence[Tensor]) -> dict[str, Array]:
-    """Return tensors, in the order of PARAMETERS and NET, as numpy arrays by name; all float64 if dtypes differ."""
+    """Return ``tensors``, in the order of PARAMETERS and NET, as a dictionary of numpy arrays by name.
+
+    If dtypes differ, all arrays are float64.
+    """
     arrays = [_cpu_array(x) for x in tensors]
     if len({x.dtype for x in arrays}) > 1:
         arrays = [x.astype(np.float64, copy=False) for x in arrays]
@@ -99,7 +102,10 @@ def _rasterizer_view(camera: Camera, viewmat: Tensor, near: float, turns: float)
 def _prepare_frame(
     request: RasterRequest, viewmat: Tensor, tensors: Sequence[Tensor], images: tuple[Array, int] | None = None
 ) -> _PreparedFrame:
-    """Return a frame's data; ``images`` is (image index (N,) of each primitive, number of images), None for one."""
+    """Project the primitives, sort them into tiles, and return the data of the frame.
+
+    ``images`` is the (N,) image index of each primitive and the number of images; None means one image.
+    """
     camera, settings = request.camera, request.settings
     arrays, threads = _rasterizer_arrays_by_name(tensors), settings.threads
     parameters = PrimitiveArrays(*(arrays[name] for name in PARAMETERS))
@@ -261,9 +267,10 @@ def render(
 def render_slabs(
     lowered: LoweredPrimitives, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
-    """Render each slab (group of primitives) alone, all in one pass; return (count, H, W) opacities and mean depths.
+    """Render each slab (group of primitives) to an image of its own; return (count, H, W) opacities and mean depths.
 
-    For arguments see :func:`neuprim.core.render.render_slabs`. A slab without primitives has opacity 0.
+    One pass renders all images. For arguments see :func:`neuprim.core.render.render_slabs`. A slab without primitives
+    has opacity 0.
     """
     means = lowered.geometry.means
     request = RasterRequest.of(lowered, camera, settings, RenderStats("cpu", len(means)))

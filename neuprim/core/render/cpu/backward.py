@@ -1,8 +1,9 @@
-"""Backward pass for primitives sorted by the depth of their centres; goes back to front through each tile.
+"""Backward pass for primitives sorted by the depth of their centres: visit the primitives of each tile back to front.
 
-T is a pixel's transmittance. T before a primitive is T behind it divided by (1 - alpha). A lane is one pixel of a
-(tile, primitive) pair. The forward pass saved the lanes' optical depths. Each pair writes one row of gradients. The
-rows of a primitive are added in a fixed order, so any number of threads gives the same bits.
+T is a pixel's transmittance. T in front of a primitive is T behind the primitive divided by (1 - alpha). A lane is one
+pixel of a (tile, primitive) pair. The optical depths of the lanes come from the forward pass. Each pair writes one row
+of gradients. The rows of a primitive are added in a fixed order, so that results do not depend on the number of
+threads.
 """
 
 from __future__ import annotations
@@ -53,10 +54,11 @@ Array = np.ndarray[Any, Any]
 class ImageGradient(NamedTuple):
     """Inputs of the backward kernels for one frame, and the rows of gradients that the kernels fill."""
 
-    # results of the forward pass
+    # results of the forward pass, see TileImage
     transmittance: Array
     last: Array
-    # dL/d of the image's arrays; g_transmittance includes the background's share, z is read if with_depth
+    # gradients of the loss by the image's colours, transmittance (including the part through the background) and zsum;
+    # z is read only if with_depth
     rgb: Array
     g_transmittance: Array
     z: Array
@@ -77,10 +79,10 @@ def lane_optical_depths(S, n, edge):  # type: ignore[no-untyped-def]
 
 @inline
 def lane_opacities(S, n, amin, amax):  # type: ignore[no-untyped-def]
-    """Fill ALPHA, the opacity of ``n`` lanes (pixels), OVER = 1/(1 - alpha) and SLOPE from DEPTH, the optical depth.
+    """Fill ALPHA, the opacity, OVER = 1/(1 - alpha) and SLOPE of ``n`` lanes (pixels) from DEPTH, the optical depth.
 
     SLOPE is d alpha/d(2 FIELD HALF FADE), the derivative by the density integral. An opacity below ``amin`` becomes 0,
-    one above ``amax`` becomes ``amax``; SLOPE is then 0.
+    and an opacity above ``amax`` becomes ``amax``. In both cases, SLOPE is 0.
     """
     for k in range(n):
         norm, depth = S[L.NORM_L + k], S[L.DEPTH + k]
@@ -101,8 +103,10 @@ def lane_opacities(S, n, amin, amax):  # type: ignore[no-untyped-def]
 def _uncomposite_rgb_row(state, S, base, at, sums, a, b, rank, color, net):  # type: ignore[no-untyped-def]
     """Undo the compositing of one primitive in a row of pixels, for three channels: recover transmittance T, fill GRAD.
 
-    With a ``net``, also fill dL/d RAY_COLOUR. Adds weights alpha T, weights x error and colour gradients to ``sums``,
-    16 numbers each. For the other arguments see ``_composite_rgb_row`` in :mod:`~neuprim.core.render.cpu.forward`.
+    GRAD is the gradient by the density integral. The function adds weights alpha T, weights x error and colour
+    gradients to ``sums``, 16 numbers for each. With a ``net`` (colour network), it fills dL/d RAY_COLOUR instead of
+    adding colour gradients. For the other arguments see ``_composite_rgb_row`` in
+    :mod:`~neuprim.core.render.cpu.forward`.
     """
     a, b = f(a), f(b)
     c0, c1, c2 = color[0], color[1], color[2]
@@ -149,7 +153,7 @@ def _uncomposite_rgb_row(state, S, base, at, sums, a, b, rank, color, net):  # t
 
 @inline
 def _weigh_colours(state, S, base, at, cg, color, net):  # type: ignore[no-untyped-def]
-    """For any number of channels: add the sum over channels of colour times dL/d colour to ``cg`` of a pixel row."""
+    """Add the sum over channels of colour times dL/d colour to ``cg`` of a pixel row, for any number of channels."""
     for c in range(color.shape[0]):
         st = state[L.G_COLOR + c * P.PIXELS + base :]
         if net is None:
@@ -166,8 +170,8 @@ def _weigh_colours(state, S, base, at, cg, color, net):  # type: ignore[no-untyp
 def _uncomposite_row(state, S, base, at, cg, w, a, b, rank):  # type: ignore[no-untyped-def]
     """Undo the compositing of one primitive in a row of pixels: recover transmittance T, fill weights ``w`` and GRAD.
 
-    For any number of channels, with depth. ``cg`` is the sum over channels of colour times dL/d colour, plus z dL/dz if
-    depth has a gradient.
+    GRAD is the gradient by the density integral. This function supports any number of channels, and depth. ``cg`` is
+    the sum over channels of colour times dL/d colour, plus z dL/dz if depth has a gradient.
     """
     a, b = f(a), f(b)
     st, lanes = state[base:], S[L.ALPHA + at :]
@@ -192,7 +196,8 @@ def _uncomposite_row(state, S, base, at, cg, w, a, b, rank):  # type: ignore[no-
 def _add_row_sums(state, S, base, at, w, sums, a, b, C, net):  # type: ignore[no-untyped-def]
     """Add weights ``w``, w x error and colour gradients of one row of pixels to ``sums``; for any number of channels.
 
-    ``sums`` has 16 numbers for each of these. With a ``net``, also fill dL/d RAY_COLOUR.
+    ``sums`` has 16 numbers for the weights, for weights x error and for each channel. With a ``net`` (colour network),
+    the function fills dL/d RAY_COLOUR instead of adding colour gradients.
     """
     st = state[base:]
     for k in range(P.TILE):
@@ -213,7 +218,10 @@ def _add_row_sums(state, S, base, at, w, sums, a, b, C, net):  # type: ignore[no
 
 @inline
 def _compact_lane_gradients(S, n, with_depths):  # type: ignore[no-untyped-def]
-    """Move lanes (pixels) with GRAD != 0 to the front, as many have GRAD = 0; append zeros; return the number moved."""
+    """Move the lanes (pixels) with GRAD != 0 to the front, append zeros, and return the number of moved lanes.
+
+    Later steps then skip the many lanes with GRAD = 0.
+    """
     count = 0
     for k in range(0, n, P.TILE):
         if with_depths:
@@ -238,9 +246,9 @@ def _sum_row(sums, first):  # type: ignore[no-untyped-def]
 
 @inline
 def _load_tile_gradients(state, tx, ty, norms, image, C):  # type: ignore[no-untyped-def]
-    """Load what the backward pass needs of a tile's pixels into ``state``; return the number of primitives to visit.
+    """Load the data of a tile's pixels into ``state``; return the number of primitives to visit.
 
-    This is 1 + the rank of the last primitive composited in any pixel.
+    The number is 1 + the rank (position in the tile's list, from 0) of the last primitive composited in any pixel.
     """
     transmittance, last, g_rgb, g_transmittance, g_z, error, _, with_depth = image
     height, width = norms.shape
@@ -391,8 +399,8 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
 def sum_tile_pair_gradients(start, stop, first, slots, pair_rows, grads, touched):  # type: ignore[no-untyped-def]
     """Fill grads[i], the sum of the gradient rows of primitive i's pairs, and touched[i], for i in ``start:stop``.
 
-    A pair is a tile and a primitive that reaches it; ``first`` and ``slots`` are those of TileLists. touched[i] is True
-    if a pixel shows the primitive.
+    A pair is a tile and a primitive that reaches it. ``first`` and ``slots`` are fields of
+    :class:`~neuprim.core.render.cpu.tiles.TileLists`. touched[i] is True if any pixel shows primitive i.
     """
     for i in range(start, stop):
         g = grads[i]

@@ -1,8 +1,8 @@
 """Compute geometry and neurons of 32 primitives (a block) at a time, in float64.
 
 A block is one flat array ``S`` with a column of 32 numbers per quantity: ``S[M + k]`` is the longest semi-axis m of the
-block's primitive k. Columns lie at constant offsets, so that LLVM vectorises. Strict floating-point arithmetic gives
-each primitive the same bits in any block.
+block's primitive k. Columns lie at constant offsets, so that LLVM vectorises. With strict floating-point arithmetic,
+the results of a primitive are bitwise the same in any block.
 """
 
 from __future__ import annotations
@@ -61,7 +61,10 @@ def dot3(a, b):  # type: ignore[no-untyped-def]
 
 @strict
 def load_block(which, n, parameters, S):  # type: ignore[no-untyped-def]
-    """Load MEANS, LOG_SCALES, QUATS, M and AXES (axes / m) of primitives ``which[:n]``; repeat the last as padding."""
+    """Load MEANS, LOG_SCALES, QUATS, M and AXES (semi-axes / m) of primitives ``which[:n]``.
+
+    The last primitive is repeated to fill the block.
+    """
     means, log_scales, quats = parameters.means, parameters.log_scales, parameters.quats
     for k in range(BLOCK):
         i = which[min(k, n - 1)]
@@ -111,11 +114,12 @@ def project_block(S, view):  # type: ignore[no-untyped-def]
 
 @strict
 def _whiten_axis(b, s, u, v, fx, fy, w):  # type: ignore[no-untyped-def]
-    """Return the parts along one ellipsoid axis of four vectors in whitened space, where the ellipsoid is a unit ball.
+    """Return the components of E0, EX, EY and XA along one ellipsoid axis, in whitened space.
 
-    They are E0, the direction of the ray at (``u``, ``v``) on the image plane z = 1; EX and EY, the changes of the
-    direction per pixel; and XA, the vector ``w`` from centre to anchor over m. ``b`` is the axis in camera axes, ``s``
-    the semi-axis divided by the longest semi-axis m, and ``fx``, ``fy`` are focal lengths in pixels.
+    In whitened space, the ellipsoid is the unit ball. E0 is the direction of the ray through (``u``, ``v``) on the
+    image plane z = 1. EX and EY are the changes of the direction per pixel in x and y. XA is the vector ``w`` from
+    centre to anchor, divided by m. ``b`` is the axis in camera axes, ``s`` the semi-axis divided by the longest
+    semi-axis m, and ``fx``, ``fy`` are focal lengths in pixels.
     """
     a0, a1, a2 = b[0] / s, b[1] / s, b[2] / s
     return a0 * u + a1 * v + a2, a0 / fx, a1 / fy, dot3((a0, a1, a2), w)
@@ -123,7 +127,11 @@ def _whiten_axis(b, s, u, v, fx, fy, w):  # type: ignore[no-untyped-def]
 
 @strict
 def _fill_block_rays(S, view):  # type: ignore[no-untyped-def]
-    """Fill a block's rays (E0 to NEAR), and sum (TOTAL) and maximum (BIGGEST) to detect overflow in float32."""
+    """Fill the numbers of rays, columns E0 to NEAR of a block, and TOTAL and BIGGEST.
+
+    TOTAL is the sum of numbers of a row, to detect NaN and infinity. BIGGEST is their largest magnitude, to detect
+    numbers that overflow float32.
+    """
     fx, fy, cx, cy, near = view.fx, view.fy, view.cx, view.cy, view.near
     for k in range(BLOCK):
         m, anchor_z, offset = S[M + k], S[ANCHOR_Z + k], S[BLOCK * P.OFFSET + k]
@@ -153,8 +161,8 @@ def _fill_block_rays(S, view):  # type: ignore[no-untyped-def]
 def _fill_block_neurons(which, n, parameters, turns, S, waves):  # type: ignore[no-untyped-def]
     """Fill ``waves`` (K, 6 BLOCK) with the neurons of a block of primitives: frequencies, phase, amplitude and speed.
 
-    Frequencies are on whitened axes. The speed is the length of the frequency vector: the largest change of the phase
-    over half a chord, in turns.
+    Frequencies are on whitened axes, in turns. The speed is the length of the frequency vector, and so the largest
+    change of the phase over half a chord, in turns.
     """
     W1, b1, w2 = parameters.W1, parameters.b1, parameters.w2
     for k in range(BLOCK):
@@ -183,7 +191,10 @@ def _fill_block_neurons(which, n, parameters, turns, S, waves):  # type: ignore[
 
 @strict
 def fill_block(which, n, parameters, view, S, waves):  # type: ignore[no-untyped-def]
-    """Compute geometry, rays, neurons of primitives ``which[:n]``; fill their block ``S``, ``waves`` (K, 6 BLOCK)."""
+    """Fill the block ``S`` with geometry and rays of primitives ``which[:n]``, and ``waves`` with their neurons.
+
+    ``waves`` (K, 6 BLOCK) has the columns of a neuron for each of K neurons, see :func:`_fill_block_neurons`.
+    """
     load_block(which, n, parameters, S)
     for k in range(BLOCK):
         S[BLOCK * P.OFFSET + k] = parameters.b2[which[min(k, n - 1)]]

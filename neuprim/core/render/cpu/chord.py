@@ -1,13 +1,14 @@
 """The integral along one chord (part of a ray inside an ellipsoid) in float32, forward and backward.
 
-Phases are in turns (2 pi) and are reduced exactly to half a turn: ``r = u - rint(u)``. A neuron's rate v is the change
-of its phase over half a chord, in turns. Its mean over the chord is its value at the middle times its profile, which is
-B_p(2 pi v). p is the exponent of the edge (:mod:`neuprim.core.model.edge`). B_0 is sinc, for a hard edge; B_1 and B_2
-are for a soft edge (density that fades to zero at the ellipsoid's boundary).
+Phases u are in turns (2 pi) and are reduced exactly to half a turn: ``r = u - rint(u)``. A neuron's rate v is the
+change of its phase over half a chord, in turns. The mean of a neuron over the chord is its value at the chord's middle
+times its profile B_p(2 pi v). p is the exponent of the edge (:mod:`neuprim.core.model.edge`). B_0 is sinc, for a hard
+edge; B_1 and B_2 are for a soft edge (density that fades to zero at the ellipsoid's boundary).
 
-cos, B_p and the exponential are polynomials (tools/fit_polynomials.py). One polynomial serves |v| up to half a turn, a
-longer one up to 1.5 turns. Beyond, with z = 2 pi v, B_1 = 3 (B_0 - cos z)/z^2 and B_2 = 15 (B_1 - B_0)/z^2. Their
-derivatives are dB_1/dz = -3 (B_1 - B_0)/z and dB_2/dz = -5 (B_2 - B_1)/z. float32 errors: below 2e-6.
+cos, B_p and the exponential are polynomials (tools/fit_polynomials.py). One polynomial of B_p serves |v| up to half a
+turn, a longer one |v| up to 1.5 turns. For larger |v| and z = 2 pi v, B_1 = 3 (B_0 - cos z)/z^2 and
+B_2 = 15 (B_1 - B_0)/z^2. The derivatives are dB_1/dz = -3 (B_1 - B_0)/z and dB_2/dz = -5 (B_2 - B_1)/z. float32 errors
+are below 2e-6.
 """
 
 from __future__ import annotations
@@ -107,9 +108,9 @@ _MEDIUM_SLOPE = {
 
 @inline
 def one_minus_exp(x):  # type: ignore[no-untyped-def]
-    """Return 1 - exp(-x) for x clamped to [0, 9.4], which suffices as alpha is at most 0.9999.
+    """Return 1 - exp(-x) for x clamped to [0, 9.4]; larger x are not needed, because alpha is at most 0.9999.
 
-    Computes exp(-x/16) - 1 by a polynomial, then doubles its argument four times.
+    The function computes exp(-x/16) - 1 by a polynomial, then doubles the exponent four times.
     """
     r = min(max(x, f(0)), _CEIL) * _SIXTEENTH
     q = (((((_E6 * r + _E5) * r + _E4) * r + _E3) * r + _E2) * r + _ONE) * r
@@ -134,7 +135,10 @@ def sinc_turns(z):  # type: ignore[no-untyped-def]
 
 @inline
 def dsinc_turns(z):  # type: ignore[no-untyped-def]
-    """Return the derivative of :func:`sinc_turns` by z; a polynomial of its own, as cos - sinc cancels for small z."""
+    """Return the derivative of :func:`sinc_turns` by z.
+
+    The derivative has its own polynomial, because the difference cos - sinc loses digits for small z.
+    """
     return ((((_D5 * z + _D4) * z + _D3) * z + _D2) * z + _D1) * z + _D0
 
 
@@ -189,7 +193,10 @@ def _hard_slopes_medium(v, w):  # type: ignore[no-untyped-def]
 
 @inline
 def _reduced_chord_rates(v, w):  # type: ignore[no-untyped-def]
-    """Return six values: v and w minus the nearest integers, whether |v|, |w| <= 1/2, and 1/v, 1/w (1 if <= 1/2)."""
+    """Return six values: v and w minus the nearest integers, whether |v| <= 1/2 and |w| <= 1/2, and 1/v and 1/w.
+
+    v and w are the rates of two neurons. A reciprocal is replaced by 1 if the rate is at most 1/2.
+    """
     k, j = np.rint(v), np.rint(w)
     a, b = k == f(0), j == f(0)
     sv, sw = f(1) if a else v, f(1) if b else w
@@ -201,7 +208,8 @@ def _reduced_chord_rates(v, w):  # type: ignore[no-untyped-def]
 def _hard_reduced(v, near, r, iv):  # type: ignore[no-untyped-def]
     """Return sinc(2 pi v) and its derivative by v, for any rate v, from r = v - rint(v) and iv = 1/v.
 
-    If ``near`` (|v| is at most half a turn), both are polynomials, else r/v sinc(2 pi r) and (cos - sinc)/v.
+    If ``near`` (|v| is at most half a turn), both are polynomials. Otherwise, sinc(2 pi v) = r/v sinc(2 pi r), and the
+    derivative is (cos(2 pi v) - sinc(2 pi v))/v.
     """
     z = r * r
     x = sinc_turns(z)
@@ -229,7 +237,10 @@ def _horner_polynomial(coefficients: tuple[float, ...]) -> Kernel:
 
 
 def _split_chord_polynomial(coefficients: tuple[float, ...]) -> Kernel:
-    """Like :func:`_horner_polynomial`, for ten coefficients, as two shorter chains whose latencies overlap."""
+    """Return a function that evaluates the polynomial with ten coefficients as two shorter chains.
+
+    Unlike in :func:`_horner_polynomial`, the latencies of the chains overlap.
+    """
     low, high = _horner_polynomial(coefficients[:5]), _horner_polynomial(coefficients[5:])
 
     @inline
@@ -281,7 +292,7 @@ def _soft_reduced(p: int) -> Kernel:
     def reduced(v, near, r, iv):  # type: ignore[no-untyped-def]
         """Return B_p(2 pi v) and its derivative by v, from r = v - rint(v) and iv = 1/v.
 
-        If ``near`` (|v| is at most half a turn), both are polynomials.
+        If ``near`` (|v| is at most half a turn), both are polynomials; otherwise, the formulas of the module apply.
         """
         z, iz = r * r, iv * f(1 / TAU)  # iz = 1/(2 pi v)
         b0, cosine = sinc_turns(z) * r * iv, cos_turns(z)
@@ -300,8 +311,8 @@ def _soft_reduced(p: int) -> Kernel:
 def _fast_chord_profiles(reduced: Kernel) -> tuple[Kernel, Kernel]:
     """Return two functions of the rates v and w of two neurons, for rates of any size.
 
-    The first gives B_p(2 pi v) and B_p(2 pi w). The second gives B_p(2 pi v), its derivative by v, B_p(2 pi w), and its
-    derivative by w. ``reduced`` computes B_p, see :func:`_hard_reduced`.
+    The first function returns B_p(2 pi v) and B_p(2 pi w). The second function returns B_p(2 pi v), the derivative of
+    B_p(2 pi v) by v, and the same two values for w. ``reduced`` computes B_p, see :func:`_hard_reduced`.
     """
 
     @inline
@@ -337,7 +348,7 @@ _MEANS = tuple(f(n / 2) for n in NORMS)  # means of (1 - u^2)^p over [-1, 1]
 
 @inline_source
 def load_ray(p):  # type: ignore[no-untyped-def]
-    """Return the numbers of a primitive's row that :func:`intersect_chord` needs, to load once for many pixels."""
+    """Return the numbers of a primitive's row that :func:`intersect_chord` needs; load them once for many pixels."""
     return (
         p[P.E0], p[P.E0 + 1], p[P.E0 + 2], p[P.EX], p[P.EX + 1], p[P.EX + 2], p[P.EY], p[P.EY + 1], p[P.EY + 2],
         p[P.XA], p[P.XA + 1], p[P.XA + 2], p[P.XU], p[P.XU + 1], p[P.XU + 2], p[P.XV], p[P.XV + 1], p[P.XV + 2],
@@ -349,10 +360,10 @@ def load_ray(p):  # type: ignore[no-untyped-def]
 def intersect_chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
     """Intersect one pixel's ray with a primitive's ellipsoid; return 16 numbers that describe the chord.
 
-    They are: offset du, dv from the anchor pixel; slide (see :mod:`neuprim.core.render.layout`); ray direction e (3)
-    and point p (3) closest to the centre, both in whitened space; D = 1 - |p|^2; ia = 1/(e.e); t of p; half the uncut
-    chord; uncut (1 if the near plane does not cut, else 0); middle t and half length of the chord beyond the near
-    plane. The last is 0 if the ray misses. Lengths are in units of m along e.
+    The 16 numbers are: offset du, dv from the anchor pixel; slide (see :mod:`neuprim.core.render.layout`); ray
+    direction e (3) and point p (3) closest to the centre, both in whitened space; D = 1 - |p|^2; ia = 1/(e.e); t of p;
+    half the uncut chord; uncut (1 if the near plane does not cut the chord, else 0); middle t and half length of the
+    chord beyond the near plane. The half length is 0 if the ray misses. Lengths are in units of m along e.
 
     ``pixel`` is 16 y + x in the tile, (``fx0``, ``fy0``) the offset of the tile's first pixel centre from the anchor.
     ``row`` is the result of :func:`load_ray`.
@@ -384,10 +395,10 @@ def intersect_chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
 
 @inline_source
 def half_chord_slope(D, ia, depth_floor, edge):  # type: ignore[no-untyped-def]
-    """Return dh/dD of the half chord h = sqrt(D ``ia``); a hard edge takes it at D of at least ``depth_floor``.
+    """Return dh/dD of the half chord h = sqrt(D ``ia``); for a hard edge, D counts as at least ``depth_floor``.
 
-    ``ia`` is 1/(e.e) for the ray direction e. D is 0 at a silhouette. A soft edge needs no such floor, because its
-    weight D^p outweighs D^-1/2.
+    ``ia`` is 1/(e.e) for the ray direction e. At a silhouette, D is 0 and dh/dD grows without bound. A soft edge needs
+    no such floor, because its weight D^p outweighs D^-1/2.
     """
     return f(0.5) * ia / np.sqrt(max(D, depth_floor if len(edge) == 0 else f(1e-12)) * ia)
 
@@ -396,7 +407,7 @@ def half_chord_slope(D, ia, depth_floor, edge):  # type: ignore[no-untyped-def]
 def chord_edge_fade(D, edge):  # type: ignore[no-untyped-def]
     """Return FADE, the mean edge weight (1 - |y|^2)^p of an uncut chord, and dFADE/dD; 1 and 0 for a hard edge (p = 0).
 
-    ``D`` is 1 - |y|^2 at the chord's middle.
+    y is a point in whitened space. ``D`` is 1 - |y|^2 at the chord's middle.
     """
     inner = max(D, f(0))
     if len(edge) == 0:
@@ -412,10 +423,10 @@ def chord_backward(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Return dL/dm (3) and dL/de (3) of a ray with origin m and direction e, from the gradients of its chord.
 
-    ``g_half`` and ``g_mid`` are the gradients by half chord and middle along the ray; q is dL/d(chord's middle point)
-    and v is dL/d(half e). ``g_tm``, ``gD`` and ``gA`` are the gradients by closest approach tm, D = 1 - |p|^2 and a =
-    e.e, with p the closest point. They exclude the parts through the chord's ends. ``dh`` is dh/dD. The other arguments
-    are results of :func:`intersect_chord`.
+    ``g_half`` and ``g_mid`` are the gradients by the half chord and by t of the chord's middle. (qx, qy, qz) is
+    dL/d(chord's middle point), and (vx, vy, vz) is dL/d(half e). ``g_tm``, ``gD`` and ``gA`` are the gradients by t of
+    the closest point p, by D = 1 - |p|^2 and by a = e.e. These three exclude the parts through the chord's ends.
+    ``dh`` is dh/dD. The other arguments are results of :func:`intersect_chord`.
     """
     gex, gey, gez = vx * half + mid * qx, vy * half + mid * qy, vz * half + mid * qz
     gt1 = (g_mid + g_half) * f(0.5)
@@ -440,11 +451,11 @@ def zero_ray_sums():  # type: ignore[no-untyped-def]
 
 @inline
 def add_ray_gradient(sums, du, dv, slide, reach, gmx, gmy, gmz, gex, gey, gez):  # type: ignore[no-untyped-def]
-    """Return ``sums`` plus one pixel's gradient by the 12 numbers E0, EX, EY, XA that define a primitive's rays.
+    """Return ``sums`` plus one pixel's gradient by E0, EX, EY, XA, the 12 numbers that define a primitive's rays.
 
-    dL/d(ray origin m) and dL/d(ray direction e) of the pixel are given; ``du`` and ``dv`` are its offset from the
-    anchor pixel. ``slide`` is how far the origin is slid along the ray; ``reach`` is the anchor's depth over m, TC,
-    plus ``slide``.
+    (gmx, gmy, gmz) and (gex, gey, gez) are the pixel's dL/d(ray origin m) and dL/d(ray direction e). ``du`` and ``dv``
+    are the pixel's offset from the anchor pixel. ``slide`` is how far the origin is slid along the ray. ``reach`` is TC
+    (depth of the anchor, in units of the longest semi-axis) plus ``slide``.
     """
     a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, b0, b1 = sums
     hx, hy, hz = gex + reach * gmx, gey + reach * gmy, gez + reach * gmz

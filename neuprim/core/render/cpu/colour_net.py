@@ -2,9 +2,9 @@
 
 The input of a network is the middle of a ray's chord, which the density's kernels store for each lane (a pixel of one
 (tile, primitive) pair). The first layer is converted in float64 to whitened axes (units of the semi-axes) and to turns,
-once per primitive, like the density's neurons. The conversion does not depend on the camera. RAY_COLOUR holds colours
-before max(0, .). Three channels have fused loops. Other numbers of channels, float64 and gradients use scratch memory
-``V``: for each unit, the cosine and its derivative.
+once per primitive, like the density's neurons. The conversion does not depend on the camera. RAY_COLOUR holds the
+colours of the lanes before max(0, .). For three channels, one loop computes all channels. Other numbers of channels,
+float64 and gradients need scratch memory ``V``, which holds the cosine of each unit and its derivative.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ Array = np.ndarray[Any, Any]
 class ColourNet(NamedTuple):
     """The colour networks of all primitives of a frame, as the pixel kernels read them."""
 
-    # (N, net_row_width) float32: per unit its first layer (WX, WY, WZ, PHASE: whitened axes, turns), then C output
-    # weights
+    # (N, net_row_width) float32: for each unit, the first layer (WX, WY, WZ, PHASE; on whitened axes, in turns), then C
+    # output weights
     rows: Array
-    wide: Array  # the same in float64 for primitives drawn in float64, by slot
-    hidden: int  # units per primitive, padded to an even number by units without output
+    wide: Array  # (M, net_row_width) float64 rows of the primitives drawn in float64, in the order of their slots
+    hidden: int  # units per primitive, padded to an even number by units whose output weights are 0
 
 
 # ---- Per primitive
@@ -76,9 +76,10 @@ def _fill_net_rows(start, stop, which, log_scales, quats, Wx, bias, Wout, out, f
 
 
 def prepare_rasterizer_colour_net(which: Array, t: dict[str, Array], wide: bool, threads: int) -> tuple[Array, Array]:
-    """Return the network rows of primitives ``which``, float64 if ``wide``, and whether each needs float64, as bool.
+    """Return the network rows of primitives ``which``, and a bool array: whether each network needs float64.
 
-    A network needs float64 if the phase of a unit changes too fast along a chord. ``t`` holds the tensors by name.
+    A network needs float64 if the phase of a unit changes too fast along a chord. The rows are float64 if ``wide``,
+    else float32. ``t`` holds the tensors by name.
     """
     H, C = t["Wx"].shape[1], t["Wout"].shape[1]
     out = np.empty((len(which), L.net_row_width(H + H % 2, C)), np.float64 if wide else np.float32)
@@ -92,10 +93,11 @@ def prepare_rasterizer_colour_net(which: Array, t: dict[str, Array], wide: bool,
 def colour_net_backward(  # type: ignore[no-untyped-def]
     start, stop, log_scales, quats, Wx, rows, grads, first, touched, g_log_scales, g_quats, g_Wx, g_bias, g_Wout,
 ):  # fmt: skip
-    """Compute the networks' gradients of primitives ``start:stop`` from gradient rows; they begin at column ``first``.
+    """Compute the gradients of the colour networks of primitives ``start:stop`` from the gradient rows ``grads``.
 
-    ``grads`` are the gradient rows, ``rows`` the network rows. Primitives that are not ``touched`` are skipped. Adds to
-    ``g_log_scales`` and ``g_quats``. The gradient through the chord's middle is already part of the density's columns.
+    The columns of the network begin at ``first`` in a gradient row. ``rows`` are the network rows. Primitives that are
+    not ``touched`` are skipped. The kernel fills ``g_Wx``, ``g_bias`` and ``g_Wout``, and adds to ``g_log_scales`` and
+    ``g_quats``. The density's columns already contain the gradient through the chord's middle.
     """
     H, C = Wx.shape[1], g_Wout.shape[1]
     local, gL, axes, gl, q, gq = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(4), np.empty(4)
@@ -215,8 +217,8 @@ def _mix_net_outputs(S, V, n, p, hidden, C):  # type: ignore[no-untyped-def]
 def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-untyped-def]
     """Evaluate the colour network of primitive ``i`` at ``n`` lanes (pixels); fill RAY_COLOUR, before max(0, .).
 
-    ``base`` is the constant colour. ``D`` has the float64 chords if the primitive is drawn in float64 (has a slot).
-    With ``slopes``, also fill ``V`` for :func:`ray_colour_gradient`.
+    ``base`` is the constant colour, to which the network adds. ``D`` has the float64 chords if the primitive is drawn
+    in float64 (has a slot). With ``slopes``, the function also fills ``V``, which :func:`ray_colour_gradient` needs.
     """
     C, p = base.shape[0], net.rows[i]
     for c in range(C):
@@ -239,7 +241,7 @@ def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-unt
 
 @inline
 def _rgb_units_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped-def]
-    """For three channels: write the gradients of two units into row ``out``; add to dL/dQ, Q the chord's middle."""
+    """Write the gradients of two units into row ``out``, for three channels; add to dL/dQ, Q the chord's middle."""
     ax, ay, az, _, a0, a1, a2 = _ray_rgb_unit(p, o)
     bx, by, bz, _, b0, b1, b2 = _ray_rgb_unit(p, o2)
     s0, s1, s2, s3, s4, s5, s6 = f(0), f(0), f(0), f(0), f(0), f(0), f(0)
@@ -275,9 +277,10 @@ def _rgb_units_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped
 
 @inline
 def _unit_gradient(S, V0, n, p, o, C, out):  # type: ignore[no-untyped-def]
-    """For any number of channels: write a network unit's gradients into ``out``; add to dL/dQ, Q the chord's middle.
+    """Write the gradients of one network unit into ``out``, for any number of channels; add to dL/dQ.
 
-    The unit begins at column ``o`` of the network row ``p``. Overwrites its cosines in ``V0``.
+    Q is the chord's middle. The unit begins at column ``o`` of the network row ``p``. The function overwrites the
+    unit's cosines in ``V0``.
     """
     wx, wy, wz = p[o + P.WX], p[o + P.WY], p[o + P.WZ]
     for c in range(C):
@@ -306,9 +309,10 @@ def _unit_gradient(S, V0, n, p, o, C, out):  # type: ignore[no-untyped-def]
 
 @inline
 def ray_colour_gradient(S, V, n, i, net, C, out, base_at):  # type: ignore[no-untyped-def]
-    """Write the gradients of a colour network into ``out``: of its constant colour at ``base_at``, then of its units.
+    """Write the gradients of a colour network into ``out``: first of the constant colour, then of the units.
 
-    The input is dL/d RAY_COLOUR of ``n`` lanes (pixels). Also adds to dL/dQ, Q the middles of the chords.
+    The gradients begin at column ``base_at``. The input is dL/d RAY_COLOUR of ``n`` lanes (pixels). The function also
+    adds to dL/dQ of the lanes, Q the middle of the chord.
     """
     p, row = net.rows[i], out[base_at + C :]
     for c in range(C):

@@ -1,11 +1,11 @@
 """Compositing in the order in which each ray enters the primitives (``sort = "entry"``), forward and backward.
 
-For each tile of 16 x 16 pixels, a pass over its primitives lists the hits. A hit is a pixel and a primitive with
-opacity above 0 in it. Each pixel's hits are sorted and composited front to back. The backward pass repeats this and
-computes the gradient by the density integral (GRAD) of every hit, back to front. A second pass over the primitives then
-writes the same gradient rows as the default kernel. No pixel can stop early, so hidden primitives take time. Chords cut
-by the near plane come first. They, and hits whose entries agree in float32, stay in the order of the primitives'
-centres.
+For each tile of 16 x 16 pixels, a pass over its primitives lists the hits. A hit is a pixel and a primitive whose
+opacity in the pixel is above 0. Each pixel's hits are sorted and composited front to back. The backward pass repeats
+these steps and computes GRAD, the gradient by the density integral, of every hit, back to front. A second pass over the
+primitives then writes the same gradient rows as the default kernel. All hits must be listed before the first can be
+composited, so hidden primitives take time. Chords that the near plane cuts come first. Such chords, and hits whose
+entries agree in float32, stay in the order of the primitives' centres.
 """
 
 from __future__ import annotations
@@ -36,10 +36,11 @@ Array = np.ndarray[Any, Any]
 
 
 class _PairLanes(NamedTuple):
-    """Scratch memory for the lanes of one (tile, primitive) pair; ``waves`` is None without a colour network.
+    """Scratch memory for the lanes (pixels) of one (tile, primitive) pair.
 
     ``S`` and ``D`` hold the lanes in float32 and float64, ``state`` the tile's pixels. For ``bounds``, ``offset`` and
-    ``rows_live`` see :func:`row_spans` and :func:`compact_lanes`.
+    ``rows_live`` see :func:`row_spans` and :func:`compact_lanes`. ``waves`` holds cosines of a colour network's units
+    and their derivatives; it is None without a network.
     """
 
     S: Array
@@ -52,10 +53,11 @@ class _PairLanes(NamedTuple):
 
 
 class _Hits(NamedTuple):
-    """The hits of one tile (pixel and primitive with opacity above 0), in the order of its (tile, primitive) pairs.
+    """The hits of one tile, in the order of the tile's (tile, primitive) pairs.
 
-    ``values`` and ``marks`` have the columns above, and ``colours`` the channels, one row per hit. The hits of pair q
-    are ``pair_start[q]`` to ``pair_start[q + 1]`` - 1. For ``listing`` and ``pixel_start`` see :func:`_sort_tile_hits`.
+    A hit is a pixel and a primitive with opacity above 0 in the pixel. ``values`` (columns H_ENTRY to H_GRAD),
+    ``marks`` (H_PIXEL, H_LANE, H_PAIR) and ``colours`` (channels) have one row per hit. The hits of pair q are
+    ``pair_start[q]`` to ``pair_start[q + 1]`` - 1. For ``listing`` and ``pixel_start`` see :func:`_sort_tile_hits`.
     """
 
     values: Array
@@ -86,7 +88,10 @@ def _allocate_lanes(C, net):  # type: ignore[no-untyped-def]
 
 @inline
 def _allocate_hits(start, stop, across, frame, C, net):  # type: ignore[no-untyped-def]
-    """Allocate memory for the hits of the largest of tiles ``start:stop``: one per pixel in the box of each pair."""
+    """Return memory for the hits of any single tile in ``start:stop``.
+
+    There is room for one hit per pixel in the pixel box of each (tile, primitive) pair.
+    """
     room, pairs = 1, 1
     for t in range(start, stop):
         first, end = frame.starts[t], frame.starts[t + 1]
@@ -114,7 +119,10 @@ def _gather_lanes(lanes, frame, pair):  # type: ignore[no-untyped-def]
 
 @inline
 def _load_tile_norms(lanes, norms, tx, ty):  # type: ignore[no-untyped-def]
-    """Load which rows of a tile lie in the image, and the lengths of its pixels' ray directions whose camera-z is 1."""
+    """Load into ``lanes`` which rows of a tile lie in the image, and the ray norm of each pixel.
+
+    The ray norm is the length of the pixel's ray direction whose camera-z is 1.
+    """
     height, width = norms.shape
     for y in range(P.TILE):
         lanes.rows_live[y] = f(1) if ty + y < height else f(0)
@@ -168,10 +176,12 @@ def _list_tile_hits(lanes, hits, frame, first, end, tx, ty, colors, net, edge): 
 
 @inline
 def _sort_tile_hits(count, hits):  # type: ignore[no-untyped-def]
-    """Fill ``listing``, the hits sorted by pixel and entry, and ``pixel_start``, each pixel's first index in it.
+    """Sort the hits of a tile: fill ``listing``, the hits by pixel and entry, and ``pixel_start``.
+
+    ``pixel_start`` holds the index of each pixel's first hit in ``listing``.
 
     A counting sort by pixel keeps each pixel's hits in the order of the primitives' centres. A stable insertion sort by
-    entry follows; few hits move far.
+    entry follows, which is fast because few hits move far.
     """
     values, marks, listing, begin = hits.values, hits.marks, hits.listing, hits.pixel_start
     begin[:] = 0
@@ -251,8 +261,8 @@ def composite_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # t
 def _uncomposite_hits(hits, ids, first, tx, ty, norms, colors, image, tmin, net):  # type: ignore[no-untyped-def]
     """Composite the hits of a tile again, then go back to front: fill every hit's weight alpha T and GRAD.
 
-    GRAD is the gradient by the hit's density integral. ``image`` is an ImageGradient, and ``first`` the tile's first
-    pair.
+    T is the transmittance before the hit, GRAD the gradient by the hit's density integral. ``image`` is an
+    ImageGradient, and ``first`` the index of the tile's first pair.
     """
     values, marks, listing, begin = hits.values, hits.marks, hits.listing, hits.pixel_start
     height, width = norms.shape
@@ -286,9 +296,10 @@ def _uncomposite_hits(hits, ids, first, tx, ty, norms, colors, image, tmin, net)
 
 @kernel
 def backward_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # type: ignore[no-untyped-def]
-    """Fill the gradient rows of the pairs of tiles ``start:stop``, with hits sorted by entry; return the lane count.
+    """Fill the gradient rows of all pairs of tiles ``start:stop``, with hits sorted by entry; return the lane count.
 
-    Unlike :func:`~neuprim.core.render.cpu.backward.backward_tiles`, which explains the arguments, it composites again.
+    For arguments see :func:`~neuprim.core.render.cpu.backward.backward_tiles`. Unlike that function, this function
+    composites the hits again, because the forward pass saves nothing for it.
     """
     frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
     across = (frame.norms.shape[1] + P.TILE - 1) // P.TILE

@@ -1,18 +1,20 @@
 """Chords and densities of pixels in float64, for the few primitives for which float32 is not accurate enough.
 
-Results are rounded to the float32 arrays of the lanes (pixels of one (tile, primitive) pair). Chords (rays inside an
-ellipsoid) that the near plane does not cut use the functions of the float32 stage, with phases reduced in float64.
+Results are rounded to float32 and stored in the arrays of the lanes (pixels of one (tile, primitive) pair). A chord is
+the part of a ray inside an ellipsoid. For hard edges, and for pairs of which the near plane cuts no chord, this module
+uses the profiles of the float32 stage, with phases reduced in float64.
 
-Those functions do not hold if the near plane cuts a chord with a soft edge. There the density fades as (1 - |y|^2)^p,
-with y the point in units of the semi-axes. u goes from -1 to 1 along the chord. With ray direction e, a = e.e, and D at
-the closest approach to the centre, 1 - |y|^2 = D - a (shift + half u)^2. shift goes from the closest approach to the
-chord's middle. The p-th power is a polynomial q in u. The mean of q cos(phase + z u) follows from the moments
+The profiles do not hold for a soft edge if the near plane cuts the chord. The density of a soft edge fades as
+(1 - |y|^2)^p, with y the point in units of the semi-axes. u goes from -1 to 1 along the chord. e is the ray direction,
+and a = e.e. D is 1 - |y|^2 at the point closest to the centre, and shift is the distance (in t) from this point to the
+chord's middle. Then 1 - |y|^2 = D - a (shift + half u)^2. The p-th power is a polynomial q in u. The mean of
+q cos(phase + z u) follows from the moments
 
     C_n = 1/2 integral of u^n cos(z u) du (n even),   S_n = 1/2 integral of u^n sin(z u) du (n odd),
     dC_n/dz = -S_(n+1), dS_n/dz = C_(n+1)
 
 which are sums of spherical Bessel functions (:mod:`neuprim.core.model.edge`). FADE is the mean of q. FIELD is the mean
-of q times density, divided by FADE, so that gradients of weights are the same for every edge.
+of q times density, divided by FADE, so that the gradients of weights use the same code for every edge.
 """
 
 from __future__ import annotations
@@ -88,9 +90,9 @@ def chords_float64(S, X, n, frame, pair, with_mid, backward, edge):  # type: ign
 
 @inline
 def chord_phase_float64(X, k, p, o):  # type: ignore[no-untyped-def]
-    """Return the phase of a network unit at the middle of lane ``k``'s chord, in turns, reduced to [-1/2, 1/2].
+    """Return the phase of a colour network's unit at the middle of lane ``k``'s chord, in turns, in [-1/2, 1/2].
 
-    ``X`` has the float64 chords, ``p`` is the float64 row of a colour network, and the unit begins at its column ``o``.
+    ``X`` has the float64 chords. ``p`` is the float64 row of the network, in which the unit begins at column ``o``.
     """
     u = X[k + _Q0] * p[o + P.WX] + X[k + _Q1] * p[o + P.WY] + X[k + _Q2] * p[o + P.WZ] + p[o + P.PHASE]
     return f(u - np.rint(u))
@@ -112,8 +114,9 @@ def _reduced_chord_phases(X, k, p, o):  # type: ignore[no-untyped-def]
 def _whole_chord_neurons(S, X, V, n, p, neurons, edge):  # type: ignore[no-untyped-def]
     """Add each neuron's mean over a chord, w2 cos(phase at the middle) B_p(phase change over half a chord), to FIELD.
 
-    B_p is the profile of edge exponent p. The near plane must not cut a chord with a soft edge. ``X`` has the float64
-    chords. ``V``, if not None, gets the factors of the neurons' gradients (N_COS, N_SIN and N_DSINC).
+    B_p is the profile for edge exponent p (:mod:`~neuprim.core.render.cpu.chord`). The near plane must not cut a chord
+    with a soft edge. ``X`` has the float64 chords. ``V``, if not None, gets the factors that the neurons' gradients
+    need (N_COS, N_SIN and N_DSINC).
     """
     for m in range(neurons):
         o = P.NEURONS + P.PER_NEURON * m
@@ -157,7 +160,7 @@ def _chord_bessel(z, j):  # type: ignore[no-untyped-def]
 def _chord_moments(z, j, M):  # type: ignore[no-untyped-def]
     """Fill M[n], n = 0..5, with the mean over u in [-1, 1] of u^n cos(z u) for even n and of u^n sin(z u) for odd n.
 
-    Overwrites ``j``.
+    ``j`` is scratch memory for six numbers.
     """
     _chord_bessel(z, j)
     M[0], M[1] = j[0], j[1]
@@ -170,8 +173,8 @@ def _chord_moments(z, j, M):  # type: ignore[no-untyped-def]
 def _edge_polynomial(D, shift, square, half, soft, q):  # type: ignore[no-untyped-def]
     """Fill q[0..4] with the coefficients by u of the edge weight (D - ``square`` (shift + half u)^2)^``soft``.
 
-    u goes from -1 to 1 along the chord, ``square`` is e.e; for D, shift and half see the module. Returns the mean
-    weight over the chord.
+    u goes from -1 to 1 along the chord. ``square`` is e.e, and ``soft`` (1 or 2) the edge exponent; for D, shift and
+    half see the module. The function returns the mean weight over the chord.
     """
     c0, c1, c2 = D - square * shift * shift, -2.0 * square * shift * half, -square * half * half
     q[0], q[1], q[2], q[3], q[4] = c0, c1, c2, 0.0, 0.0
@@ -184,9 +187,9 @@ def _edge_polynomial(D, shift, square, half, soft, q):  # type: ignore[no-untype
 def _cut_chord_neurons(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped-def]
     """Add the neurons' means to FIELD for soft-edged chords that the near plane cuts; fill FADE, the mean edge weight.
 
-    ``soft`` is the edge exponent. ``V``, if not None, gets the factors of the neurons' gradients. Then BY_D, BY_A and
-    BY_TM are filled, too: the derivatives of FADE FIELD by D, a = e.e and the closest approach tm through the edge
-    weight.
+    ``soft`` is the edge exponent. ``V``, if not None, gets the factors that the neurons' gradients need. In this case,
+    the function also fills BY_D, BY_A and BY_TM: the derivatives of FADE FIELD, through the edge weight, by D, by
+    a = e.e and by t of the closest point.
     """
     q, j, M, rest = np.zeros(5), np.zeros(6), np.zeros(6), np.zeros(3)
     for k in range(n):

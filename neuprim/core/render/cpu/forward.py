@@ -1,9 +1,9 @@
 """Forward pass for primitives sorted by the depth of their centres: composite tiles, and save data for backward.
 
-A lane is one pixel of a (tile, primitive) pair. The pass saves the optical depth of every evaluated lane (4 bytes). Per
-pair it saves a mask of tile rows with unfinished pixels (2 bytes) and the index of its first lane (4 bytes). From
-these, the backward pass gets all opacities without evaluating densities. For most primitives, it then evaluates only
-the lanes that have a gradient.
+A lane is one pixel of a (tile, primitive) pair. The forward pass saves the optical depth of every evaluated lane (4
+bytes). For each pair, the pass also saves a mask of the tile rows with unfinished pixels (2 bytes) and the index of the
+pair's first lane (4 bytes). From these data, the backward pass computes all opacities without evaluating densities. For
+most primitives, the backward pass then evaluates only the lanes that have a gradient.
 """
 
 from __future__ import annotations
@@ -47,8 +47,9 @@ class TileImage(NamedTuple):
     rgb: Array
     transmittance: Array
     zsum: Array  # (H, W) sum of w z, filled if with_depth
-    last: Array  # (H, W) rank + 1 of each pixel's last contributor; if sorted by entry, its hits
-    background: Array
+    # (H, W) rank + 1 of the last primitive composited in each pixel; if sorted by entry, number of composited hits
+    last: Array
+    background: Array  # (C,)
     with_depth: bool
 
 
@@ -56,14 +57,14 @@ class TileImage(NamedTuple):
 class SavedForBackward:
     """Data that the forward pass of one frame saves for the backward pass; empty if no gradient is needed.
 
-    A pair is (tile, primitive), a lane one of its pixels. A tile row is live until a check finds T < T_min in all its
-    pixels.
+    A pair is a tile and a primitive that reaches it; a lane is one pixel of a pair. A tile row is live until a check
+    finds that the transmittance T is below T_min in all pixels of the row.
     """
 
     # (pairs,) bit y is set if row y of the tile was live when the pair was drawn; no pairs if nothing is saved
     live: Array
     first_lane: Array  # (pairs,) first lane of each pair in the depths of its chunk
-    # per chunk of tiles (lanes,) optical depth of each evaluated lane
+    # one (lanes,) array per chunk of tiles: the optical depth of each evaluated lane
     depths: list[Array] = field(default_factory=list)
 
     @classmethod
@@ -82,7 +83,10 @@ def _live_tile_row_bits(rows_live):  # type: ignore[no-untyped-def]
 
 @inline
 def _depth_array(floats):  # type: ignore[no-untyped-def]
-    """Return an uninitialised (floats,) float32 array, aligned to a cache line; unwritten pages take no memory."""
+    """Return an uninitialised float32 array of length ``floats``, aligned to a cache line.
+
+    Pages of the array that are never written take no memory.
+    """
     block = np.empty(floats + 16, np.float32)
     shift = -(np.int64(block.ctypes.data) // 4) % 16
     return block[shift : shift + floats]
@@ -90,7 +94,10 @@ def _depth_array(floats):  # type: ignore[no-untyped-def]
 
 @inline
 def _max_lanes(start, stop, across, frame):  # type: ignore[no-untyped-def]
-    """Return a bound of the lanes (pixels of all pairs) of tiles ``start:stop``; pairs count multiples of 16."""
+    """Return an upper bound of the number of lanes (pixels of all pairs) of tiles ``start:stop``.
+
+    The number of each pair is rounded up to a multiple of 16.
+    """
     lanes = 0
     for t in range(start, stop):
         tx, ty = (t % across) * P.TILE, (t // across) * P.TILE
@@ -103,8 +110,8 @@ def _max_lanes(start, stop, across, frame):  # type: ignore[no-untyped-def]
 def _store_opacities(S, n, frame, edge, keep, depths, at):  # type: ignore[no-untyped-def]
     """Fill ALPHA, the opacity of ``n`` lanes (pixels), from their chords; if ``keep``, save optical depths.
 
-    The optical depths go to ``depths[at:]``. Opacities below alpha_min, and of optical depths <= 0, become 0. Others
-    are at most alpha_max.
+    The optical depths go to ``depths[at:]``. An opacity below alpha_min becomes 0, as does the opacity of an optical
+    depth <= 0. Every other opacity is at most alpha_max.
     """
     amin, amax = frame.alpha_min, frame.alpha_max
     for k in range(n):
@@ -124,7 +131,9 @@ def _store_opacities(S, n, frame, edge, keep, depths, at):  # type: ignore[no-un
 
 @inline
 def _composite_rgb_row(state, S, base, at, a, b, tmin, rank, color, net):  # type: ignore[no-untyped-def]
-    """For three channels: composite a primitive onto a row of pixels: add alpha T colour, update transmittance T.
+    """Composite a primitive with three colour channels into a row of pixels: add alpha T colour, update T.
+
+    alpha is the primitive's opacity in a pixel, T the pixel's transmittance.
 
     ``state`` has the tile's pixel arrays, in which the row begins at ``base``. Pixels ``a`` to ``b`` - 1 are inside the
     silhouette; pixel k of the row is lane ``at`` + k of ``S``. Pixels with T < ``tmin`` do not change. ``rank``, 1 +
@@ -151,7 +160,7 @@ def _composite_rgb_row(state, S, base, at, a, b, tmin, rank, color, net):  # typ
 
 @inline
 def _composite_row(state, S, base, at, a, b, tmin, rank, w):  # type: ignore[no-untyped-def]
-    """Like :func:`_composite_rgb_row`, without colours: update transmittance T, fill the weights ``w`` = alpha T."""
+    """Like :func:`_composite_rgb_row`, but fill the weights ``w`` = alpha T instead of adding colours."""
     a, b = f(a), f(b)
     st, lanes = state[base:], S[L.ALPHA + at :]
     for k in range(P.TILE):
@@ -166,7 +175,10 @@ def _composite_row(state, S, base, at, a, b, tmin, rank, w):  # type: ignore[no-
 
 @inline
 def _add_colours(state, S, base, at, w, color, net):  # type: ignore[no-untyped-def]
-    """Add ``w`` times ``color``, or with a ``net`` times RAY_COLOUR, to a row of pixels; any number of channels."""
+    """Add weight ``w`` times ``color`` to the colours of a row of pixels, for any number of channels.
+
+    With a ``net`` (colour network), RAY_COLOUR replaces ``color``.
+    """
     for c in range(color.shape[0]):
         st = state[L.COLOR + c * P.PIXELS + base :]
         if net is None:
@@ -181,7 +193,10 @@ def _add_colours(state, S, base, at, w, color, net):  # type: ignore[no-untyped-
 
 @inline
 def _fill_background(tx, ty, down, wide_row, image):  # type: ignore[no-untyped-def]
-    """Fill a tile without primitives with the background; it has ``down`` rows of ``wide_row`` pixels from (tx, ty)."""
+    """Fill a tile that has no primitives with the background.
+
+    The part of the tile inside the image has ``down`` rows of ``wide_row`` pixels, from pixel (tx, ty).
+    """
     for y in range(down):
         Y = index(ty + y)
         for x in range(wide_row):
@@ -217,8 +232,8 @@ def _store_tile(state, tx, ty, down, wide_row, image):  # type: ignore[no-untype
 def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, edge):  # type: ignore[no-untyped-def]
     """Render tiles ``start:stop``; return the number of evaluated lanes, and an array with the lanes' optical depths.
 
-    A lane is one pixel of a (tile, primitive) pair. If the frame has the tiles of several images, one image after the
-    other, ``live`` must be empty.
+    A lane is one pixel of a (tile, primitive) pair. If the frame has several images, ``live`` must be empty, because
+    the backward pass supports only one image.
 
     Args:
         frame: :class:`~neuprim.core.render.cpu.tiles.FrameArrays`.

@@ -1,8 +1,9 @@
-"""Compute the gradients of a (tile, primitive) pair from those of its lanes (pixels), for both orders of compositing.
+"""Compute the gradient row of a (tile, primitive) pair from the gradients of its lanes (pixels).
 
-A lane's gradient is dL/d(2 FIELD HALF FADE), the gradient by its density integral: mean density, half chord and mean
-edge weight. :func:`neuron_gradients` and :func:`chord_gradient` read stored chords, as needed for float64, colour
-networks and many neurons. :func:`gradients_at_once` keeps each chord in registers, for at most two neurons.
+Both orders of compositing use this module. A lane's gradient is dL/d(2 FIELD HALF FADE), the gradient by the density
+integral: 2 x mean density x half chord x mean edge weight. :func:`neuron_gradients` and :func:`chord_gradient` read
+stored chords, which float64, colour networks and many neurons need. :func:`gradients_at_once` keeps each chord in
+registers, for at most two neurons.
 """
 
 from __future__ import annotations
@@ -42,11 +43,12 @@ def _load_neuron(p, o):  # type: ignore[no-untyped-def]
 
 
 def _neuron_products(slopes):  # type: ignore[no-untyped-def]
-    """Return a function that computes cos B, d(cos B)/d phase and cos dB/d rate of two neurons, B their chord profile.
+    """Return a function that computes cos B, d(cos B)/d phase and cos dB/d rate for each of two neurons.
 
-    cos is that of the phase at the chord's middle. B is the factor from the value at the middle to the mean over the
-    chord. ``slopes`` computes B and dB/d rate. The function's argument q is the chord middle, its v the half chord as a
-    vector. ``first`` and ``second`` are results of :func:`_load_neuron`.
+    cos is the cosine of the phase at the chord's middle. B is the neuron's profile, the factor from its value at the
+    middle to its mean over the chord. ``slopes`` computes B and dB/d rate. In the returned function, (qx, qy, qz) is
+    the chord's middle, and (vx, vy, vz) the half chord as a vector. ``first`` and ``second`` are results of
+    :func:`_load_neuron`.
     """
 
     @inline
@@ -71,10 +73,11 @@ _slow, _medium, _fast = _neuron_products(slopes_slow), _neuron_products(slopes_m
 
 @inline
 def _add_neuron_gradient(sums, cosine, u, v, qx, qy, qz, vx, vy, vz):  # type: ignore[no-untyped-def]
-    """Return ``sums`` plus a lane's dL/d(amplitude, phase, W) of a neuron, the last two without the factor amplitude.
+    """Return ``sums`` plus one lane's dL/d(amplitude, phase, W) of a neuron.
 
-    ``cosine``, ``u`` and ``v`` are the results of :func:`_neuron_products` times dL/d FIELD. q is the chord's middle,
-    and (vx, vy, vz) the half chord as a vector.
+    dL/d phase and dL/dW still lack the factor amplitude. ``cosine``, ``u`` and ``v`` are the results of
+    :func:`_neuron_products` times dL/d FIELD. (qx, qy, qz) is the chord's middle, and (vx, vy, vz) the half chord as a
+    vector.
     """
     s0, s1, s2, s3, s4 = sums
     return s0 + cosine, s1 + u, s2 + (u * qx + v * vx), s3 + (u * qy + v * vy), s4 + (u * qz + v * vz)
@@ -82,7 +85,7 @@ def _add_neuron_gradient(sums, cosine, u, v, qx, qy, qz, vx, vy, vz):  # type: i
 
 @inline
 def _store_neuron_gradient(sums, amplitude, m, out):  # type: ignore[no-untyped-def]
-    """Write the sums of neuron ``m``, times its ``amplitude`` where missing, into a gradient row."""
+    """Write the sums of neuron ``m`` into gradient row ``out``; multiply the sums for phase and W by ``amplitude``."""
     s0, s1, s2, s3, s4 = sums
     o = P.G_NEURONS + P.PER_NEURON * m
     out[o + P.AMPLITUDE], out[o + P.PHASE] = s0, amplitude * s1
@@ -94,7 +97,7 @@ def _store_neuron_gradient(sums, amplitude, m, out):  # type: ignore[no-untyped-
 
 @inline
 def _gradients_without_neurons(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-def]
-    """Do the work of :func:`gradients_at_once` for a density without neurons, f = b2."""
+    """Do the work of :func:`gradients_at_once` for a density without neurons, which is the constant b2."""
     p, fx0, fy0, depth_floor = frame.rows[pair.i], pair.fx0, pair.fy0, frame.depth_floor
     row, tc, field = load_ray(p), p[P.TC], p[P.OFFSET]
     total, rays = f(0), zero_ray_sums()
@@ -170,7 +173,7 @@ _with_two_fast = _gradients_of_two_neurons(_fast)
 def gradients_at_once(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-def]
     """Fill the gradient row of a (tile, primitive) pair, for at most :data:`AT_ONCE` neurons, from PIXEL and GRAD.
 
-    PIXEL and GRAD hold position and gradient, dL/d(2 FIELD HALF FADE), of each lane (pixel of the pair).
+    PIXEL holds the position of each lane (pixel of the pair), GRAD the lane's gradient dL/d(2 FIELD HALF FADE).
     """
     if frame.neurons == 0:
         _gradients_without_neurons(S, n, frame, pair, edge, out)
@@ -191,8 +194,8 @@ def gradients_at_once(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-
 def lanes_with_slopes(S, D, V, n, frame, pair, edge):  # type: ignore[no-untyped-def]
     """Compute the chords of ``n`` lanes (pixels) of a (tile, primitive) pair; in float64 also FIELD and ``V``.
 
-    ``V`` gets three products per neuron for its gradients: N_COS, N_SIN and N_DSINC. Returns True if the pair is in
-    float64 and the near plane cuts a chord.
+    ``V`` gets three products for each neuron, which the neuron's gradients need: N_COS, N_SIN and N_DSINC. The function
+    returns True if the pair is in float64 and the near plane cuts a chord.
     """
     slot = frame.slots[pair.i]
     if slot >= 0:
@@ -205,10 +208,11 @@ def lanes_with_slopes(S, D, V, n, frame, pair, edge):  # type: ignore[no-untyped
 
 @inline
 def _chord_field_gradient(S, n, out, edge, in_float64):  # type: ignore[no-untyped-def]
-    """Fill dL/d FIELD of ``n`` lanes from dL/d(2 FIELD HALF FADE); sum up dL/d b2 and the gradient by log m.
+    """Fill GF = dL/d FIELD of ``n`` lanes from dL/d(2 FIELD HALF FADE); store the sums of dL/d b2 and of G_LOG_M.
 
-    FIELD, the mean of the density network over a chord, is recovered from the optical depth, except in float64. GRAD is
-    doubled, to dL/d(FIELD HALF FADE). The gradients of chords, to which neurons add, are set to 0.
+    FIELD is the mean of the density network over a chord. Except in float64, the function recovers FIELD from the
+    optical depth. It doubles GRAD, to dL/d(FIELD HALF FADE), and sets the gradients of chords, to which neurons add,
+    to 0.
     """
     offset, log_m = f(0), f(0)
     for k in range(n):
@@ -272,9 +276,9 @@ _two_float64 = _two_neuron_lane_gradients(None)
 
 @inline
 def neuron_gradients(S, V, n, p, kinds, neurons, edge, in_float64, cut, out):  # type: ignore[no-untyped-def]
-    """Fill the gradients of b2, log m and every neuron of a (tile, primitive) pair, and of its lanes' chords.
+    """Fill the gradients of b2, log m and every neuron of a (tile, primitive) pair, and of the chords of its lanes.
 
-    The latter are dL/dQ, Q the middle of the chord, and dL/d(half e), half e the half chord as a vector. ``p`` is the
+    The gradients of a chord are dL/dQ, Q its middle, and dL/d(half e), half e the half chord as a vector. ``p`` is the
     primitive's row, ``kinds`` its ranges of rates. ``V`` (float64 only) and ``cut`` are from :func:`lanes_with_slopes`.
     """
     _chord_field_gradient(S, n, out, edge, in_float64)
@@ -297,10 +301,11 @@ def neuron_gradients(S, V, n, p, kinds, neurons, edge, in_float64, cut, out):  #
 def chord_gradient(S, n, p, out, edge, cut):  # type: ignore[no-untyped-def]
     """Fill dL/d(E0, EX, EY, XA) of a primitive's rays from the gradients by chord middle, half chord and direction.
 
-    With a hard edge, gradients flow through the chord's ends. A soft edge adds the gradient of its weight through D = 1
-    - |p|^2 at the closest point p. If no chord of the pair is cut by the near plane, BY_D is d FADE/dD. If one is
-    ``cut`` (float64), the density is zero at the ends or the end is fixed, so ends have no gradient. Instead, BY_D,
-    BY_A and BY_TM are the derivatives of FADE FIELD by D, a = e.e and the closest approach tm.
+    With a hard edge, gradients flow through the chord's ends. A soft edge adds the gradient of the edge weight through
+    D = 1 - |p|^2 at the closest point p. If the near plane cuts no chord of the pair, BY_D is d FADE/dD. If the near
+    plane cuts a chord (``cut``, only in float64), the ends have no gradient, because an end is either fixed by the near
+    plane or at zero density. Instead, BY_D, BY_A and BY_TM are the derivatives of FADE FIELD by D, by a = e.e and by t
+    of the closest point.
     """
     tc, soft = p[P.TC], len(edge)
     rays = zero_ray_sums()

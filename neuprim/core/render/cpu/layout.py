@@ -1,9 +1,9 @@
 """Row widths of the numba kernels' arrays, and offsets of the kernels' scratch arrays.
 
-A kernel handles one (tile, primitive) pair at a time; a tile has 16 x 16 pixels. It copies the pixels inside the
-primitive's silhouette into a list without gaps. An entry of this list is a *lane*. A scratch array has one element per
-lane, and its name is its offset in a flat array: ``S[HALF + k]`` is the half chord of lane k. The arrays of a tile's
-pixels (``T_`` and following) lie in another flat array, ``state``.
+A kernel handles one (tile, primitive) pair at a time; a tile has 16 x 16 pixels. The kernel copies the pixels inside
+the primitive's silhouette into a list without gaps. An entry of this list is a *lane*. A scratch array has one element
+per lane. The name of a scratch array is its offset in a flat array: ``S[HALF + k]`` is the half chord of lane k. The
+arrays of a tile's pixels (``T_`` and following) lie in another flat array, ``state``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def _padded_row_width(floats: int) -> int:
 
 
 def row_width(neurons: int) -> int:
-    """Return the length of a primitive's row, a multiple of 16; ``neurons`` is already rounded up to an even number."""
+    """Return the number of floats in a primitive's row, a multiple of 16; the caller rounds ``neurons`` up to even."""
     return _padded_row_width(NEURONS + PER_NEURON * neurons)
 
 
@@ -36,15 +36,16 @@ def net_row_width(hidden: int, channels: int) -> int:
 
 
 def gradient_width(neurons: int, channels: int, hidden: int = 0) -> int:
-    """Return the number of floats in a gradient row (gradients of one primitive's numbers), a multiple of 16.
+    """Return the number of floats in a gradient row, a multiple of 16.
 
-    ``neurons`` and ``hidden`` (units of a colour network) are already rounded up to even numbers.
+    A gradient row holds the gradients with respect to one primitive's numbers. ``neurons`` and ``hidden`` (units of a
+    colour network) are already rounded up to even numbers.
     """
     return _padded_row_width(G_NEURONS + PER_NEURON * neurons + channels + (NET_OUT + channels) * hidden)
 
 
 def lane_array(number: int) -> int:
-    """Return the offset of scratch array ``number`` in flat scratch memory; it has one element per lane (pixel)."""
+    """Return the offset, in flat scratch memory, of scratch array ``number``, which has one element per lane."""
     return LANES * number
 
 

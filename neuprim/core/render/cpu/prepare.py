@@ -1,9 +1,10 @@
 """Project primitives to the screen, in float64: anchor pixels, rays in whitened space, exact screen bounds.
 
-In whitened space (units of the semi-axes), a primitive is the unit ball. The anchor pixel of a primitive shows its
-centre. A primitive near or behind the camera is anchored at the camera instead. Whitened rays are affine in the pixel
-offset from the anchor, so float32 need not represent the distance to the camera. The ray parameter t has the unit m,
-the longest semi-axis. Images do not depend on anchor and unit, so the backward pass treats both as constants.
+In whitened space (units of the semi-axes), a primitive is the unit ball. The anchor of a primitive is the pixel that
+shows its centre, at the centre's depth. A primitive near or behind the camera is anchored at the camera instead. The
+numbers of a whitened ray are affine in the pixel offset from the anchor, so float32 need not represent the distance to
+the camera. The ray parameter t has the unit m, the longest semi-axis. Images do not depend on the choice of anchor and
+unit, so the backward pass treats both as constants.
 """
 
 from __future__ import annotations
@@ -62,7 +63,8 @@ class PrimitiveArrays(NamedTuple):
 class View(NamedTuple):
     """A camera: world-to-camera rotation R and translation t, intrinsics and size in pixels, depth of the near plane.
 
-    Kernels count phases in turns of 2 pi. ``turns`` = omega0 / 2 pi is the density's factor from W1 and b1 to turns.
+    Kernels count phases in turns of 2 pi. The density's weights W1 and biases b1 times ``turns`` = omega0 / 2 pi are in
+    turns.
     """
 
     R: Array
@@ -85,7 +87,7 @@ class Projected(NamedTuple):
     spans: Array
     boxes: Array
     kinds: Array  # (N, K/2) range of rates (SLOW, MEDIUM, FAST) of row neurons 2m and 2m + 1
-    order: Array  # (N, K) the model's index of each row neuron; they are stored by rising rate
+    order: Array  # (N, K) the model's index of each neuron of a row; a row stores neurons by rising rate
     depth: Array  # (N,) camera-z of the centres
     status: Array  # (N,) P.VISIBLE, P.CULLED or P.NON_FINITE
     in_float64: Array  # (N,) whether float32 is not enough for the primitive's pixels
@@ -110,8 +112,8 @@ class Projected(NamedTuple):
 def _is_too_faint_to_draw(most, edge, least):  # type: ignore[no-untyped-def]
     """Return whether no chord through a primitive, from any camera, can reach the optical depth ``least``.
 
-    ``most`` = b2 + sum |w2| bounds density times m, the longest semi-axis. Half chords are at most m, so the optical
-    depth is at most ``most`` N_p. N_p is the integral of the edge weight of exponent p = ``edge``.
+    ``most`` = b2 + sum |w2| is an upper bound of density times m, the longest semi-axis. Half chords are at most m, so
+    the optical depth is at most ``most`` N_p. N_p is the integral of (1 - u^2)^p over [-1, 1], p = ``edge``.
     """
     return most <= 0.0 or most * NORMS[edge] <= least
 
@@ -120,9 +122,9 @@ def _is_too_faint_to_draw(most, edge, least):  # type: ignore[no-untyped-def]
 def _visible_square(most, longest, edge, least):  # type: ignore[no-untyped-def]
     """Return r^2, where only rays through the ellipsoid scaled by r can reach the optical depth ``least``.
 
-    r^2 = 1 - (least / (most N_p longest))^(1/(p + 1/2)) with p = ``edge``, see :mod:`neuprim.core.render.layout`. It is
-    1 for the whole ellipsoid and 0 if no ray can. ``most`` is b2 + sum |w2|, and ``longest`` bounds half chords in
-    units of the longest semi-axis. The result is rounded to float32, so that backends agree.
+    r^2 = 1 - (least / (most N_p longest))^(1/(p + 1/2)) with p = ``edge``, see :mod:`neuprim.core.render.layout`. r^2
+    is 1 for the whole ellipsoid, and 0 if no ray can reach ``least``. ``most`` is b2 + sum |w2|. ``longest`` is an
+    upper bound of half chords, in units of the longest semi-axis. r^2 is rounded to float32, so that backends agree.
     """
     share = least / (most * NORMS[edge] * longest)
     if share >= 1.0:
@@ -134,7 +136,7 @@ def _visible_square(most, longest, edge, least):  # type: ignore[no-untyped-def]
 
 @strict
 def _is_finite_undrawn_primitive(i, parameters, most):  # type: ignore[no-untyped-def]
-    """Return whether all parameters of a primitive that is not drawn are finite; ``most`` is b2 + sum |w2|."""
+    """Return whether all parameters of primitive ``i``, which is not drawn, are finite; ``most`` is b2 + sum |w2|."""
     means, log_scales, quats, W1, b1, _, _ = parameters
     total, square = most, np.float64(0.0)
     for a in range(3):
@@ -150,12 +152,12 @@ def _is_finite_undrawn_primitive(i, parameters, most):  # type: ignore[no-untype
 def _silhouette_screen_extent(z, ci, s22, square, b, axes, towards, focal, middle):  # type: ignore[no-untyped-def]
     """Return the first and last pixel coordinate, along one screen axis, of an ellipsoid's silhouette.
 
-    The ellipsoid is scaled by ``square`` ** 0.5. The range lies between the tangents to the silhouette, as in
-    ``screen_boxes`` of the float64 reference renderer. Lengths are in units of the ellipsoid's longest semi-axis. ``z``
-    and ``ci`` are the centre's camera coordinates in depth and along the screen axis. ``axes`` are the semi-axes,
-    ``focal`` and ``middle`` focal length and principal point in pixels. ``b`` and ``towards`` are the rows of the
+    The ellipsoid is first scaled by ``square`` ** 0.5. The two coordinates are those of the tangents to the silhouette,
+    as in :func:`~neuprim.core.render.reference.screen_boxes`. Lengths are in units of the longest semi-axis. ``z`` is
+    the centre's depth, ``ci`` the centre's camera coordinate along the screen axis. ``axes`` are the semi-axes,
+    ``focal`` and ``middle`` the focal length and principal point in pixels. ``b`` and ``towards`` are the rows of the
     orientation matrix B, in camera axes, for the screen axis and for depth. ``s22`` is the (z, z) entry of B diag(s^2)
-    B^T, unscaled.
+    B^T of the unscaled ellipsoid.
     """
     (b0, b1, b2), (s0, s1, s2), (d0, d1, d2), szz = b, axes, towards, square * s22
     sii = square * ((b0 * s0) ** 2 + (b1 * s1) ** 2 + (b2 * s2) ** 2)
@@ -169,10 +171,11 @@ def _silhouette_screen_extent(z, ci, s22, square, b, axes, towards, focal, middl
 def _longest_half_chord(c, m, reach, tc, fx, fy, e_length, ex_length, ey_length):  # type: ignore[no-untyped-def]
     """Return an upper bound, <= 1, of the half chords of all rays, in units of the longest semi-axis m.
 
-    A direction d with camera-z 1 is e in whitened space, and its half chord is at most m |d|/|e|. No point is farther
-    than m from the centre, which bounds the slopes of the rays, |d| and |e|. The bound is 1 where the anchor is not the
-    centre (``tc`` is 0). ``c`` is the centre in camera axes, ``reach`` half the ellipsoid's extent in depth. The last
-    three arguments are the lengths of e at the anchor and of its changes per pixel.
+    Let e be a ray direction d with camera-z 1, converted to whitened space. The half chord is at most m |d|/|e|. No
+    point of the ellipsoid is farther than m from the centre, which limits the slopes of the rays and so |d| and |e|.
+    The bound is 1 if the primitive is anchored at the camera (``tc`` is 0). ``c`` is the centre in camera axes,
+    ``reach`` half the ellipsoid's extent in depth. The last three arguments are the length of e at the anchor, and the
+    lengths of the change of e per pixel in x and in y.
     """
     u, v, wide = abs(c[0] / c[2]), abs(c[1] / c[2]), m / (c[2] - reach)
     du, dv = wide * (1.0 + u), wide * (1.0 + v)
@@ -188,9 +191,9 @@ def _cross(a, b):  # type: ignore[no-untyped-def]
 
 @strict
 def _moment_slope(x, e, axis, tc):  # type: ignore[no-untyped-def]
-    """Return the derivative of a ray's moment (point x cross direction e) by the pixel offset along a screen axis.
+    """Return the derivative, by the pixel offset along a screen axis, of x cross e for a ray with point x, direction e.
 
-    ``axis`` is the derivative of e, and ``tc`` times ``axis`` that of x.
+    ``axis`` is the derivative of e, and ``tc`` times ``axis`` the derivative of x.
     """
     a, b = _cross(x, axis), _cross(axis, e)
     return a[0] + tc * b[0], a[1] + tc * b[1], a[2] + tc * b[2]
@@ -203,11 +206,11 @@ def _rounded(x):  # type: ignore[no-untyped-def]
 
 @strict
 def _bound_block(S, view, edge, least):  # type: ignore[no-untyped-def]
-    """Fill silhouettes, pixel boxes and status of a block of primitives, and whether each needs float64.
+    """Fill silhouettes, pixel boxes and status of a block of primitives, and whether each primitive needs float64.
 
     ``S`` is a block (32 primitives) with the columns of :func:`fill_block` and MOST. ``edge`` is the exponent p,
-    ``least`` the lowest optical depth that is drawn. Rays of primitives in float64 do not slide, so their TU, TV, XU
-    and XV are replaced.
+    ``least`` the lowest optical depth that is drawn. Ray origins of float64 primitives are not slid along the ray, so
+    the function replaces TU, TV, XU and XV of these primitives.
     """
     fx, fy, cx, cy, near = view.fx, view.fy, view.cx, view.cy, view.near
     width, height, soft = float(view.width), float(view.height), edge > 0
@@ -295,7 +298,7 @@ def _bound_block(S, view, edge, least):  # type: ignore[no-untyped-def]
 
 @exact_kernel
 def prepare_wide(start, stop, which, parameters, view, order, wide):  # type: ignore[no-untyped-def]
-    """Fill ``wide[n]`` for n in ``start:stop``: the float64 row of primitive ``which[n]``, drawn in float64."""
+    """Fill ``wide[n]``, the float64 row of primitive ``which[n]``, for n in ``start:stop``."""
     parameters, view, own = borrow_arrays(parameters), borrow_arrays(view), allocate_block(parameters.W1.shape[1])
     S, waves, rate, block = borrow_arrays(own)
     for first in range(start, stop, BLOCK):
@@ -331,8 +334,8 @@ def _store_block(block, n, S, waves, rate, out):  # type: ignore[no-untyped-def]
 def prepare_primitives(start, stop, parameters, view, edge, least, out):  # type: ignore[no-untyped-def]
     """Project primitives ``start:stop``; fill ``out``. Silhouettes contain all rays that reach optical depth ``least``.
 
-    ``edge`` is the exponent p. A primitive that is too faint for any ray to reach that depth gets only a status, an
-    empty box and a depth of 0.
+    ``out`` is a :class:`Projected`, ``edge`` the exponent p. A primitive that is too faint for any ray to reach
+    ``least`` gets only a status, an empty box and a depth of 0.
     """
     parameters, view, out = borrow_arrays(parameters), borrow_arrays(view), borrow_arrays(out)
     w2, b2, boxes = parameters.w2, parameters.b2, out.boxes

@@ -1,6 +1,6 @@
-"""Backward pass of the projection of primitives: from gradient rows to parameter gradients, in float64, by blocks.
+"""Backward pass of projection: compute parameter gradients from gradient rows, in float64, for 32 primitives at a time.
 
-A gradient row holds the gradients by the numbers of a primitive's row. A block is 32 primitives.
+A gradient row holds the gradients with respect to the numbers of a primitive's row. A block is 32 primitives.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ _COLUMNS = COLUMNS + 56
 def _axis_gradient(b, s, g, reference, w, fx, fy):  # type: ignore[no-untyped-def]
     """Return dL/d(column of B), dL/d(log semi-axis s) and the part of -m dL/d(centre) for one axis of an ellipsoid.
 
-    B is the orientation in camera axes. ``g`` is dL/d(E0, EX, EY, XA), the numbers of the rays, along this axis; ``b``
-    is the axis's column of B, and ``s`` its length over m. ``reference`` is the anchor on the image plane z = 1, ``w``
-    the vector from the centre to the anchor, over m.
+    B is the orientation in camera axes, m the longest semi-axis. ``g`` is dL/d(E0, EX, EY, XA) along the axis, the
+    gradient by the numbers of the rays. ``b`` is the axis's column of B, and ``s`` the semi-axis divided by m.
+    ``reference`` is the anchor on the image plane z = 1, ``w`` the vector from the centre to the anchor, divided by m.
     """
     a = b[0] / s, b[1] / s, b[2] / s
     gx = g[3]
@@ -59,7 +59,7 @@ def _axis_gradient(b, s, g, reference, w, fx, fy):  # type: ignore[no-untyped-de
 
 @strict
 def _rays_backward(S, view):  # type: ignore[no-untyped-def]
-    """Fill dL/d(orientation B, log scales, centre in camera axes) of a block from the gradients by its rays."""
+    """Fill dL/d(orientation B, log scales, centre in camera axes) of a block from dL/d(E0, EX, EY, XA)."""
     fx, fy, cx, cy = view.fx, view.fy, view.cx, view.cy
     for k in range(BLOCK):
         m, c, s = S[M + k], load3(S, CENTRE, k), load3(S, AXES, k)
@@ -82,7 +82,7 @@ def _rays_backward(S, view):  # type: ignore[no-untyped-def]
 
 @strict
 def _neuron_backward(S, turns):  # type: ignore[no-untyped-def]
-    """Fill dL/dW1 of one neuron of a block of primitives; add its part of dL/d(log scales, LOCAL, log m).
+    """Fill dL/dW1 of one neuron of a block of primitives; add the neuron's part of dL/d(log scales, LOCAL, log m).
 
     LOCAL is the orientation in scene axes, m the longest semi-axis. ``turns`` is omega0 / 2 pi.
     """
@@ -105,10 +105,10 @@ def _neuron_backward(S, turns):  # type: ignore[no-untyped-def]
 
 @strict
 def _geometry_backward(S, R):  # type: ignore[no-untyped-def]
-    """Fill dL/d(means, log scales, quaternions) of a block of primitives, whose other gradients are complete.
+    """Fill dL/d(means, log scales, quaternions) of a block of primitives from the gradients that are already complete.
 
-    These are the gradients by B and LOCAL (orientation in camera and scene axes), log m and the centre in camera axes.
-    R is the camera's rotation.
+    The inputs are dL/dB, dL/dLOCAL (B and LOCAL: orientation in camera and scene axes), dL/d log m (m: longest
+    semi-axis) and dL/d(centre in camera axes). R is the camera's rotation.
     """
     x, y, z = (R[0, 0], R[1, 0], R[2, 0]), (R[0, 1], R[1, 1], R[2, 1]), (R[0, 2], R[1, 2], R[2, 2])
     for k in range(BLOCK):
@@ -193,8 +193,9 @@ def _backward_block(which, n, parameters, view, projected, grads, out, g_view, S
 def prepare_backward(start, stop, parameters, view, projected, grads, touched, out, g_view):  # type: ignore[no-untyped-def]
     """Compute parameter gradients of primitives ``start:stop`` from gradient rows ``grads``; zeros if not ``touched``.
 
-    Fills ``out`` (:class:`PrimitiveArrays`, float32) and ``g_view`` (N, 3, 4), each primitive's part of dL/d(R | t),
-    the camera's rotation and translation. Pass zeros as ``g_view``, or an empty array if dL/d(R | t) is not needed.
+    (R | t) is the camera's rotation and translation. The kernel fills ``out`` (:class:`PrimitiveArrays`, float32) and
+    ``g_view`` (N, 3, 4), each primitive's part of dL/d(R | t). The caller passes ``g_view`` as zeros, or as an empty
+    array if dL/d(R | t) is not needed.
     """
     parameters, view, projected = borrow_arrays(parameters), borrow_arrays(view), borrow_arrays(projected)
     grads, out, g_view = borrow_array(grads), borrow_arrays(out), borrow_array(g_view)

@@ -1,8 +1,8 @@
-"""Tiles of 16 x 16 pixels: which primitives reach each tile, front to back, and which pixels of it each one covers.
+"""Tiles of 16 x 16 pixels: which primitives reach each tile, front to back, and which pixels each primitive covers.
 
-Forward and backward pass do the same per (tile, primitive) pair. They find the pixels of each row inside the
-silhouette, and gather them into a compact list of lanes (one per pixel). They compute chords and neurons of all lanes,
-and write the results back row by row.
+The forward and the backward pass take the same steps for each (tile, primitive) pair. They find the pixels of each tile
+row that are inside the silhouette, and gather these pixels into a compact list of lanes. Then they compute the chords
+and neurons of all lanes, and write the results back row by row.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class TileLists:
     starts: NDArray[np.int64]  # (tiles + 1,) first pair of each tile
     ids: NDArray[np.int32]  # (pairs,) primitive of each pair
     first: NDArray[np.int64]  # (N + 1,) first entry of each primitive in slots
-    slots: NDArray[np.int32]  # (pairs,) index in ids of each primitive's pairs
+    slots: NDArray[np.int32]  # (pairs,) indices in ids of the pairs of primitive 0, then of primitive 1 and so on
 
     @property
     def pairs(self) -> int:
@@ -61,8 +61,9 @@ class TileLists:
 def depth_order(depth: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the indices that sort primitives front to back by ``depth``; equal depths stay in index order.
 
-    Sorts unique integer keys (depth bits above, index below), many times faster than a stable float argsort. With 1
-    million primitives, depths that agree to about 2e-10 of their value count as equal.
+    The function sorts unique integer keys with the bits of the depth above and the index below. This is many times
+    faster than a stable float argsort. With 1 million primitives, depths that agree to about 2e-10 of their value count
+    as equal.
     """
     count = depth.shape[0]
     bits = max(int(count - 1).bit_length(), 1)
@@ -77,8 +78,8 @@ def depth_order(depth: NDArray[np.float64]) -> NDArray[np.int64]:
 def _reached_tiles(start, stop, projected, across, first):  # type: ignore[no-untyped-def]
     """Return the tiles that the silhouettes of primitives ``start:stop`` reach, with a margin of 1e-3 pixels.
 
-    The result is int32: tile numbers, counted row by row with ``across`` tiles per row. Those of one primitive follow
-    each other, in the order of primitive indices. ``first[i + 1]`` gets the number of tiles of primitive i.
+    The result holds int32 tile numbers, counted row by row with ``across`` tiles per row: first all tiles of primitive
+    ``start``, then all tiles of the next primitive and so on. ``first[i + 1]`` gets the number of tiles of primitive i.
     """
     rows, spans, boxes, status = projected.rows, projected.spans, projected.boxes, projected.status
     tiles, n = np.empty(4096, np.int32), 0
@@ -119,9 +120,9 @@ def _reached_tiles(start, stop, projected, across, first):  # type: ignore[no-un
 
 @exact_kernel
 def _sort_pairs_by_tile(order, first, tiles, starts, ids, slots):  # type: ignore[no-untyped-def]
-    """Sort (tile, primitive) pairs by tile, with a counting sort, so that each tile's list is front to back.
+    """Sort (tile, primitive) pairs by tile; the primitives of each tile stay in the order of ``order``, front to back.
 
-    ``order`` has the primitives from front to back. Primitive i reaches the tiles ``tiles[first[i] : first[i + 1]]``.
+    This is a counting sort. Primitive i reaches the tiles ``tiles[first[i] : first[i + 1]]``.
     Fills ``starts`` (given as zeros), ``ids`` and ``slots`` of :class:`TileLists`.
     """
     for k in range(tiles.shape[0]):
@@ -141,7 +142,7 @@ def _sort_pairs_by_tile(order, first, tiles, starts, ids, slots):  # type: ignor
 def bin_primitives(
     projected: Projected, width: int, height: int, threads: int, images: tuple[Array, int] | None = None
 ) -> TileLists:
-    """Return the (tile, primitive) pairs of a frame; an image has ``width`` x ``height`` pixels.
+    """Return the sorted (tile, primitive) pairs of a frame with images of ``width`` x ``height`` pixels.
 
     ``images`` holds each primitive's image index, (N,), and the number of images; None means one image. The tiles of
     several images are numbered image by image.
@@ -169,8 +170,8 @@ class FrameArrays(NamedTuple):
     # (N, SPAN_WIDTH) silhouettes and (N, 4) pixel boxes
     spans: Array
     boxes: Array
-    kinds: Array  # (N, K/2) range of rates of each pair of neurons
-    # first pair of each tile, primitive of each pair
+    kinds: Array  # (N, K/2) range of rates (SLOW, MEDIUM or FAST) of each pair of neurons
+    # first pair of each tile, and primitive of each pair (TileLists)
     starts: Array
     ids: Array
     norms: Array  # (H, W) length of each pixel's ray direction whose camera-z is 1
@@ -185,8 +186,8 @@ class FrameArrays(NamedTuple):
 class PairWindow(NamedTuple):
     """The pixels of one tile that lie in the pixel box of primitive ``i``: columns x0:x1 and rows y0:y1 of the tile.
 
-    (tx, ty) is the tile's first pixel. (fx0, fy0) is the offset of this pixel's centre from the primitive's anchor
-    pixel, which shows its centre.
+    (tx, ty) is the tile's first pixel. (fx0, fy0) is the offset from the primitive's anchor, the pixel that usually
+    shows the primitive's centre, to the centre of the tile's first pixel.
     """
 
     i: int
@@ -221,14 +222,20 @@ def box_pixels(frame, i, tx, ty):  # type: ignore[no-untyped-def]
 
 @inline
 def aligned_tile_zeros(floats):  # type: ignore[no-untyped-def]
-    """Return float32 zeros aligned to a cache line; numba aligns to 32 bytes, and a vector in two lines costs twice."""
+    """Return a float32 array of zeros aligned to a cache line of 64 bytes.
+
+    numba aligns arrays only to 32 bytes, and access to a vector that spans two cache lines costs twice.
+    """
     room = np.zeros(floats + 16, np.float32)
     shift = -(np.int64(room.ctypes.data) // 4) % 16
     return room[shift : shift + floats]
 
 
 def _emit_prefetch(context, address):  # type: ignore[no-untyped-def]
-    """Define the intrinsic ``_prefetch(address)`` of a cache line. Nothing is read, so any address is allowed."""
+    """Define the intrinsic ``_prefetch(address)``, which prefetches the cache line at ``address``.
+
+    The program reads no data, so any address is allowed.
+    """
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         byte, i32 = ir.IntType(8).as_pointer(), ir.IntType(32)
@@ -246,7 +253,7 @@ _prefetch: Any = intrinsic(_emit_prefetch)
 
 @inline
 def prefetch_pair(i, frame):  # type: ignore[no-untyped-def]
-    """Prefetch what the next (tile, primitive) pair reads first: row, silhouette and box of primitive ``i``."""
+    """Prefetch the row, silhouette and pixel box of primitive ``i``, which the next (tile, primitive) pair reads."""
     rows, spans, boxes = frame.rows, frame.spans, frame.boxes
     row = rows.ctypes.data + i * rows.strides[0]
     for at in range(0, rows.strides[0], 64):
@@ -266,9 +273,9 @@ def prefetch_lane_depths(depths, first, stop):  # type: ignore[no-untyped-def]
 def row_spans(span, pair, rows_live, bounds):  # type: ignore[no-untyped-def]
     """Find the pixels ``bounds[y]`` to ``bounds[y + 16]`` - 1 of each tile row y that are inside a silhouette.
 
-    ``span`` is the primitive's silhouette (columns SKEW to HY), ``pair`` a :class:`PairWindow`. Rows with a
-    ``rows_live`` of 0, whose pixels are all finished, are empty. Because of a margin for rounding, a few pixels may be
-    outside.
+    ``span`` is the primitive's silhouette (columns SKEW to HY), ``pair`` a :class:`PairWindow`. A row gets no pixels if
+    its ``rows_live`` is 0, because then all its pixels are finished. Because of a margin for rounding, a few pixels may
+    be outside the silhouette.
     """
     skew, xc, yc, hx = span[P.SKEW], span[P.XC] - pair.fx0, span[P.YC] - pair.fy0, span[P.HX]
     ihy = f(1) / span[P.HY]
@@ -293,9 +300,9 @@ def compact_lanes(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-
     """Gather the pixels inside a silhouette into lanes: fill PIXEL and NORM_L; return the number of lanes.
 
     ``bounds`` has the pixels of each tile row, from :func:`row_spans`. Row y of the tile starts at lane ``offset[y]``.
-    NORM_L is the length of the pixel's ray direction whose camera-z is 1, from ``state``. Behind the last lane follow
-    16 padding lanes with the first lane's pixel and a NORM_L of 0. Every row copies a whole vector without a branch;
-    the next row, or the padding, overwrites the excess.
+    NORM_L is the length of the pixel's ray direction whose camera-z is 1, from ``state``. After the last lane, 16
+    padding lanes follow, with the first lane's pixel and a NORM_L of 0. Every row copies a whole vector of 16 pixels
+    without a branch; the next row, or the padding, overwrites the excess.
     """
     n = 0
     for y in range(y0, y1):
@@ -317,8 +324,9 @@ def lane_chords(S, n, frame, pair, with_mid, backward, edge):  # type: ignore[no
     """Compute the chords (rays inside the primitive) of n lanes (pixels): middle Q, direction E, half length HALF.
 
     Q and E are in whitened space, where the primitive is the unit ball. HALF is 0 where the ray misses. FIELD is set to
-    b2 and FADE to the mean edge weight. ``with_mid`` adds MID for the depth image, and ``backward`` what gradients
-    need. The near plane must not cut a soft-edged chord: such primitives are drawn in float64.
+    b2 and FADE to the mean edge weight. ``with_mid`` also fills MID, for the depth image. ``backward`` also fills the
+    arrays that gradients need. The near plane must not cut a chord with a soft edge, because primitives with such
+    chords are drawn in float64.
     """
     p, fx0, fy0, depth_floor = frame.rows[pair.i], pair.fx0, pair.fy0, frame.depth_floor
     row, offset = load_ray(p), p[P.OFFSET]
@@ -347,10 +355,11 @@ def lane_chords(S, n, frame, pair, with_mid, backward, edge):  # type: ignore[no
 
 
 def _neuron_values(profiles):  # type: ignore[no-untyped-def]
-    """Return a function that adds w2 cos(phase at middle) B_p(rate x half chord), two neurons' means, to FIELD.
+    """Return a function that adds the means of two neurons over each lane's chord to FIELD.
 
-    B_p is the profile of :mod:`~neuprim.core.render.cpu.chord`, which ``profiles`` computes for both. In the function,
-    ``p`` is the primitive's row, and the first neuron begins at column ``o``.
+    The mean of a neuron is w2 cos(phase at the middle) B_p(2 pi v), v the change of the phase over half a chord in
+    turns. ``profiles`` computes B_p, see :mod:`~neuprim.core.render.cpu.chord`, for both neurons. In the returned
+    function, ``p`` is the primitive's row, and the first neuron begins at column ``o``.
     """
 
     @inline
@@ -383,8 +392,8 @@ _values_fast = _neuron_values(profiles_fast)
 def chord_field_values(S, D, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
     """Compute chords of ``n`` lanes (pixels) and FIELD, the mean of the density network over each chord.
 
-    The mean is weighted by the edge weight (1 - |y|^2)^p. If the primitive needs float64, ``D`` gets the float64
-    chords. For the other arguments see :func:`lane_chords`.
+    The mean is weighted by the edge weight (1 - |y|^2)^p, y the point in whitened space. If the primitive needs
+    float64, ``D`` gets the float64 chords. For the other arguments see :func:`lane_chords`.
     """
     i = pair.i
     if frame.slots[i] >= 0:

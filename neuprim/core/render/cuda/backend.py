@@ -1,4 +1,4 @@
-"""Render a frame by the cuda backend as one autograd operation, on its tensors' device and torch's current stream."""
+"""Render a frame with the cuda backend, as one autograd operation on the tensors' device and torch's current stream."""
 
 from __future__ import annotations
 
@@ -118,16 +118,17 @@ def render(
 ) -> RenderOutput:
     """Render a frame; see :data:`neuprim.core.render.output.Draw` for arguments and result.
 
-    ``capacity`` fixes the sizes of the frame's arrays, so that the host never waits for the GPU. Then colours must be
-    :class:`Constant`, and the statistics contain these sizes instead of counts.
+    ``capacity`` fixes the sizes of the frame's arrays, so that the host never waits for the GPU. With a ``capacity``,
+    colours must be :class:`Constant`, and the statistics contain the sizes of the arrays instead of counts.
     """
     return rasterize(_Rasterize, "cuda", lowered, camera, background, settings, capacity)
 
 
 def frame_counts(stats: RenderStats) -> tuple[int, int, int, int]:
-    """Return the counts of a differentiable frame without capacity, in the order of :class:`FrameCapacity`.
+    """Return the counts of a frame that was rendered without capacity, in the order of :class:`FrameCapacity`.
 
-    They count (tile, primitive) pairs, primitives in float64, slots (pixels of all pairs), and pairs in float64.
+    The counts are the numbers of (tile, primitive) pairs, primitives in float64, slots (pixels of all pairs) and pairs
+    in float64. The last two are 0 if the frame needed no slots.
     """
     return stats.pairs, stats.extra["float64"], stats.extra["hits"], stats.extra["float64_pairs"]
 
@@ -135,10 +136,10 @@ def frame_counts(stats: RenderStats) -> tuple[int, int, int, int]:
 def render_slabs(
     lowered: LoweredPrimitives, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
-    """Render each slab (group of primitives) to an image of its own, all in one frame, without gradients.
+    """Render each slab (group of primitives) to an image of its own; return (count, H, W) opacities and mean depths.
 
-    Return (count, H, W) opacities and mean depths; an empty slab has opacity 0. ``slabs`` (N,) has the slab of each
-    primitive, 0 to ``count`` - 1. See :func:`neuprim.core.render.render_slabs`.
+    One frame renders all images, without gradients. A slab without primitives has opacity 0. ``slabs`` (N,) has the
+    slab of each primitive, 0 to ``count`` - 1. See :func:`neuprim.core.render.render_slabs`.
     """
     means, settings = lowered.geometry.means, replace(settings, depth=True)
     tensors = rasterizer_tensors(lowered)

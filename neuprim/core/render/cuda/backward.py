@@ -1,13 +1,14 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Backward pass of compositing: compute gradients of the primitives' rows from the gradient of the image.
 
-A pair is a tile and a primitive that reaches it. A slot holds what the forward pass saved for one pixel of a pair. A
-hit is a slot whose primitive lies on the pixel's ray.
+A pair is a tile and a primitive that reaches it. A slot holds the data that the forward pass saved for one pixel of a
+pair. A hit is a slot whose primitive lies on the pixel's ray.
 
-1. First kernel, one block per tile, one thread per pixel: visit the hits back to front. Store dL/dI, I the optical
-   depth, and the weight alpha T in each slot.
-2. Second kernel, one warp per pair: recompute chords and neurons, sum in registers, and write one gradient row.
-3. Add each primitive's rows in the order of its pairs, so reruns give the same bits.
+1. The first kernel runs one block per tile and one thread per pixel. Each thread visits its hits back to front, and
+   stores dL/dI, I the optical depth, and the weight alpha T in each slot.
+2. The second kernel runs one warp per pair. The warp recomputes chords and neurons, sums gradients in registers, and
+   writes one gradient row.
+3. The third kernel adds each primitive's rows in the order of its pairs, so that reruns give the same bits.
 
 With 8 neurons the sums take 59 of 128 registers, so the second kernel recomputes cheap values instead of keeping them.
 """
@@ -76,7 +77,10 @@ from neuprim.core.settings import RenderSettings
 
 @functools.cache
 def pixels_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return the kernel that computes dL/dI of hits, one thread per pixel; ``depth``: depth images have a gradient."""
+    """Return the kernel that computes dL/dI of the hits, I the optical depth, with one thread per pixel.
+
+    ``depth`` tells whether the depth image has a gradient.
+    """
     C, H = form.channels, form.hidden
     colours, width = L.rasterizer_colour_column(form.neurons), L.rasterizer_row_columns(form.neurons, C)
     vecC = wp.types.vector(length=C, dtype=wp.float32)
@@ -89,9 +93,9 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
     ):  # fmt: skip
         """Replace (alpha, T) in each slot by (dL/dI, w): dL/dI = (1 - alpha) T dL/dw - b, with the weight w = alpha T.
 
-        I is the optical depth of the hit, T the transmittance before it. b belongs to the light behind the hit: it is
-        the sum of w dL/dw over later hits, plus T_end dL/dT_end at the end of the ray. Where alpha is clamped to
-        alpha_max, dL/dI is 0.
+        I is the optical depth of the hit, T the transmittance in front of the hit. b is the part of the gradient from
+        behind the hit: the sum of w dL/dw over later hits, plus T_end dL/dT_end at the end of the ray. Where alpha is
+        clamped to alpha_max, dL/dI is 0.
         """
         tile, lane = wp.tid()
         across = (size[0] + L.TILE - 1) // L.TILE
@@ -145,7 +149,10 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
 
 @functools.cache
 def pairs_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return the kernel for gradient rows of pairs, one warp each; ``depth``: depth images have a gradient."""
+    """Return the kernel that writes the gradient rows of float32 pairs, with one warp per (tile, primitive) pair.
+
+    ``depth`` tells whether the depth image has a gradient.
+    """
     K, P, C = form.neurons, form.edge, form.channels
     W, width = L.rasterizer_row_columns(K, C), L.gradient_width(K, C)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)
@@ -304,7 +311,10 @@ def sum_pairs(
 
 @functools.cache
 def uncomposite_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return a kernel like :func:`pixels_kernel` for hits sorted by entry; slots (alpha, T) become (dL/dI, weight)."""
+    """Return the version of :func:`pixels_kernel` for hits sorted by entry.
+
+    The kernel replaces (alpha, T) in each slot by (dL/dI, weight alpha T).
+    """
     C, H = form.channels, form.hidden
     colours = L.rasterizer_colour_column(form.neurons)
 
@@ -356,9 +366,10 @@ def uncomposite_kernel(form: KernelForm, depth: bool) -> Any:
 
 @dataclass
 class ImageGradient:
-    """Gradient of the loss with respect to the image, and an error per pixel; float32 and contiguous.
+    """Gradient of the loss with respect to the image, and an error per pixel; tensors are float32 and contiguous.
 
-    The backward pass sums weight x error over each primitive's pixels. Population control uses these sums.
+    The backward pass sums weight x error over each primitive's pixels. Population control (which adds and removes
+    primitives during training) uses these sums.
     """
 
     rgb: Tensor  # (H W, C)
@@ -376,9 +387,10 @@ def rasterizer_gradient_rows(
     settings: RenderSettings,
     gradient: ImageGradient,
 ) -> tuple[Tensor, Tensor | None]:
-    """Return the gradient rows of N primitives, (N, gradient_width), and those of their colour networks.
+    """Return the gradient rows of N primitives, (N, gradient_width), and the gradient rows of their colour networks.
 
-    The latter are (N, net_gradient_row_width), or None without networks. Overwrites ``drawn.hits``, the saved slots.
+    The rows of networks are (N, net_gradient_row_width), or None without networks. The function overwrites the slots
+    that the forward pass saved, ``drawn.hits``.
     """
     lists, device, depth = frame.lists, frame.device, gradient.z is not None
     pairs, tiles = lists.pairs, lists.starts.shape[0] - 1

@@ -1,8 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """List the primitives that reach each tile, by their silhouettes; CUDA version of :mod:`neuprim.core.render.cpu.tiles`.
 
-Entries are counted before they are written, and sorted by integer keys, so reruns give the same bits. The host waits
-once for the counts, unless the caller gives the sizes of the arrays (:class:`FrameCapacity`).
+The kernels count the entries before they write any, and the entries are sorted by integer keys, so that reruns give
+the same bits. The host waits once for the counts, unless the caller gives the sizes of the arrays
+(:class:`FrameCapacity`).
 """
 
 import functools
@@ -65,9 +66,9 @@ class FrameCapacity:
     def around(
         cls, counts: Sequence[int], refused: Tensor, zeros: bool, least: "FrameCapacity | None" = None
     ) -> "FrameCapacity":
-        """Return 1.5 x ``counts`` + 256, in the order of the fields, or the sizes of ``least`` where these are larger.
+        """Return a capacity with the sizes 1.5 x ``counts`` + 256; ``counts`` has the order of the fields.
 
-        With ``zeros``, a count of 0 gets the size 0.
+        No size is less than the same size of ``least``. With ``zeros``, a count of 0 gets the size 0 instead of 256.
         """
         sizes = [0 if zeros and not count else int(_MARGIN * count) + _SPARE for count in counts]
         if least is not None:
@@ -81,33 +82,34 @@ class FrameCapacity:
         return (self.pairs, self.in_float64, self.slots, self.float64_pairs)
 
     def fits(self, counts: Sequence[int]) -> bool:
-        """Return whether a frame with these counts, in the order of the fields, fits."""
+        """Return whether a frame with these counts, in the order of the fields, fits into the arrays."""
         return all(count <= size for count, size in zip(counts, self.sizes, strict=True))
 
 
 @dataclass(frozen=True)
 class TileCounts:
-    """Sizes of a frame's arrays, and running sums of counts on the device."""
+    """Sizes of a frame's arrays on the host, and running sums of the primitives' counts on the device."""
 
     pairs: int  # (tile, primitive) pairs
     in_float64: int  # primitives that are drawn in float64
     bad: int  # the first primitive that is not finite, or -1
-    ends: Tensor  # (2, N) int64 on the device, running sums of tiles and of in_float64 primitives
+    # (2, N) int64 on the device: running sums over primitives of the tiles reached, and of primitives in float64
+    ends: Tensor
 
 
 @dataclass(frozen=True)
 class TileLists:
     """Pairs (tile, primitive), sorted by image (if there are several), then by tile, depth and index.
 
-    With a :class:`FrameCapacity`, arrays have room for more pairs; zeros fill the rest. The last of ``starts`` is the
-    number of pairs.
+    With a :class:`FrameCapacity`, the arrays have room for more pairs, and zeros fill the rest. The last element of
+    ``starts`` is the number of pairs.
     """
 
     starts: Tensor  # (tiles + 1,) int32, first pair of each tile, of all images
     ids: Tensor  # (pairs,) int32, primitive of each pair
     tile_of: Tensor  # (pairs,) int32, tile of each pair in its image
     first: Tensor  # (N + 1,) int32, first entry of each primitive in slots_of
-    slots_of: Tensor  # (pairs,) int32, index in ids of each primitive's pairs
+    slots_of: Tensor  # (pairs,) int32, indices in ids of the pairs of primitive 0, then of primitive 1 and so on
 
     @property
     def pairs(self) -> int:
@@ -123,10 +125,11 @@ def running_sums(counts: Tensor) -> Tensor:
 
 
 def count_tiles(counts: Tensor, bad: Tensor, capacity: FrameCapacity | None = None) -> TileCounts:
-    """Return the sizes of a frame's arrays from ``counts`` (2, N): tiles reached, and 1 for primitives in float64.
+    """Return the sizes of a frame's arrays and the running sums of ``counts``.
 
-    ``bad`` (1,) is the first primitive that is not finite, or N. Waits for the device if there is no ``capacity``.
-    Raises BackendUnavailable if there are too many pairs.
+    Row 0 of ``counts`` (2, N) is the number of tiles that each primitive reaches; row 1 is 1 for primitives in float64.
+    ``bad`` (1,) is the first primitive that is not finite, or N. Without a ``capacity``, the function waits for the
+    device. Raises BackendUnavailable if there are 2^31 or more (tile, primitive) pairs.
     """
     ends = running_sums(counts)
     if capacity is not None:
@@ -144,7 +147,10 @@ def count_tiles(counts: Tensor, bad: Tensor, capacity: FrameCapacity | None = No
 
 @wp.func
 def projected_covariance(p: ProjectedPrimitive, i: int, j: int):
-    """Return entry (i, j) of B diag(s^2) B^T / m^2; B: orientation in camera axes, s: semi-axes, m: the longest one."""
+    """Return entry (i, j) of B diag(s^2) B^T / m^2.
+
+    B is the ellipsoid's orientation in camera axes, s its semi-axes, and m the longest semi-axis.
+    """
     return wp.dot(wp.cw_mul(p.B[i], p.B[j]), wp.cw_mul(p.axes, p.axes))
 
 
@@ -152,7 +158,8 @@ def projected_covariance(p: ProjectedPrimitive, i: int, j: int):
 def silhouette_screen_extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.float64, square: wp.float64):
     """Return the first and last pixel coordinate of an ellipsoid's silhouette along screen ``axis``, 0 (x) or 1 (y).
 
-    The ellipsoid is first scaled by ``square``^0.5. ``s22`` is its :func:`projected_covariance` at (2, 2).
+    The ellipsoid is first scaled by ``square``^0.5. ``s22`` is entry (2, 2) of :func:`projected_covariance` before
+    scaling.
     """
     z, ci, szz = p.centre[2] / p.m, p.centre[axis] / p.m, square * s22
     sii, siz = square * projected_covariance(p, axis, axis), square * projected_covariance(p, axis, 2)
@@ -165,10 +172,11 @@ def silhouette_screen_extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.
 
 @wp.struct
 class SilhouetteSpans:
-    """A silhouette as a span of each pixel row, and whether the primitive needs float64 (0 or 1).
+    """A silhouette as one span per pixel row; ``in_float64`` is 1 if float32 is not accurate over its spans, else 0.
 
-    Pixel offsets are relative to the anchor pixel, which usually shows the centre. At offset dv, the span is xc +
-    skew (dv - yc) +- hx (1 - ((dv - yc)/hy)^2)^0.5. hx and hy are UNBOUNDED if the silhouette is no ellipse.
+    Pixel offsets (du, dv) are relative to the anchor pixel, which usually shows the centre. In the row at offset dv,
+    the ends of the span are xc + skew (dv - yc) +- hx (1 - ((dv - yc)/hy)^2)^0.5. hx and hy are UNBOUNDED if the
+    silhouette is not an ellipse.
     """
 
     skew: wp.float64
@@ -183,8 +191,8 @@ class SilhouetteSpans:
 def silhouette_spans(p: ProjectedPrimitive, r: Ray, width: int, height: int, square: wp.float64):
     """Return the silhouette of an ellipsoid scaled by ``square``^0.5, in an image of ``width`` x ``height`` pixels.
 
-    Rays with origin x and direction e hit it if ``square`` |e|^2 > |x cross e|^2, in coordinates in which the unscaled
-    ellipsoid is the unit sphere.
+    A ray with origin x and direction e hits the scaled ellipsoid if ``square`` |e|^2 > |x cross e|^2, in coordinates in
+    which the unscaled ellipsoid is the unit sphere.
     """
     o = SilhouetteSpans()
     o.hx = _UNBOUNDED
@@ -246,7 +254,7 @@ def longest_half_chord(p: ProjectedPrimitive, r: Ray, v: View, reach: wp.float64
 
 @wp.func
 def _chord_bound_by_edge(edge: int, hard: wp.float64, one: wp.float64, two: wp.float64):
-    """Return ``hard``, ``one`` or ``two`` for edge 0, 1 or 2. Indexing an array would need stack memory."""
+    """Return ``hard``, ``one`` or ``two`` for edge exponent 0, 1 or 2; indexing an array would need stack memory."""
     number = hard
     if edge == 1:
         number = one
@@ -263,9 +271,10 @@ def is_too_faint_to_draw(most: wp.float64, edge: int, least: wp.float64):
 
 @wp.func
 def visible_square(most: wp.float64, bound: wp.float64, edge: int, least: wp.float64):
-    """Return r^2, where only rays through the ellipsoid scaled by r can reach optical depth ``least``; 0: none can.
+    """Return r^2, where only rays through the ellipsoid scaled by r can reach the optical depth ``least``.
 
-    ``most`` is b2 + sum |w2|. Half chords are at most ``bound``, in units of the longest semi-axis.
+    r^2 is 0 if no ray can reach ``least``. ``most`` is b2 + sum |w2|. Half chords are at most ``bound``, in units of
+    the longest semi-axis.
     """
     square, share = d(0.0), least / (most * _chord_bound_by_edge(edge, _N0, _N1, _N2) * bound)
     if share <= _chord_bound_by_edge(edge, _W0, _W1, _W2):
@@ -279,9 +288,9 @@ def visible_square(most: wp.float64, bound: wp.float64, edge: int, least: wp.flo
 class Ellipse:
     """A primitive's silhouette on the screen, in pixels, from the float32 values that pixel kernels read.
 
-    With d = y + ``base``, row y is covered at ``middle`` + ``skew`` d +- ``hx`` (1 - (d/``hy``)^2)^0.5. The rightmost
-    point has d = ``peak``, the leftmost d = -``peak``. ``bounded`` is 0 if the silhouette is no ellipse but only the
-    ``box`` (x0, y0, x1, y1).
+    With d = y + ``base``, the silhouette covers row y between ``middle`` + ``skew`` d - h and ``middle`` + ``skew`` d +
+    h, where h = ``hx`` (1 - (d/``hy``)^2)^0.5. The rightmost point has d = ``peak``, the leftmost point d = -``peak``.
+    If ``bounded`` is 0, the silhouette is not an ellipse, and only the ``box`` (x0, y0, x1, y1) is valid.
     """
 
     box: wp.vec4i
@@ -312,7 +321,7 @@ def silhouette_ellipse(span: wp.vec4, hy: wp.float32, ux: wp.float32, uy: wp.flo
 
 @wp.func
 def tile_range(e: Ellipse, ty: int):
-    """Return the range [first, end) of tiles that the silhouette reaches in row ``ty`` of tiles."""
+    """Return the range [first, end) of the tiles that the silhouette ``e`` reaches in tile row ``ty``."""
     lo, hi = e.box[0] // _TILE, (e.box[2] - 1) // _TILE + 1
     if e.bounded > 0:
         d0 = wp.max(d(wp.max(ty * _TILE, e.box[1])) + e.base, -e.hy)
@@ -333,14 +342,20 @@ def tile_range(e: Ellipse, ty: int):
 
 @wp.func
 def _primitives_fit(ends: Longs2d, pairs: int, which: Ints):
-    """Return whether a frame's pairs and float64 primitives fit into the arrays; ``ends``: running sums of counts."""
+    """Return whether a frame's pairs and float64 primitives fit into the arrays.
+
+    ``ends`` holds the running sums of the counts, ``pairs`` and the length of ``which`` are the sizes of the arrays.
+    """
     last = ends.shape[1] - 1
     return ends[0, last] <= wp.int64(pairs) and ends[1, last] <= wp.int64(which.shape[0])
 
 
 @functools.cache
 def _binning_kernels(short: bool) -> tuple[Any, Any]:
-    """Return the kernels ``emit`` and ``list_pairs``. ``short`` sort keys are int32, which sort in half the time."""
+    """Return the kernels ``emit`` and ``list_pairs``, with int32 sort keys if ``short``, else int64.
+
+    int32 keys sort in half the time.
+    """
     number = wp.int32 if short else wp.int64
     Keys: Any = wp.array(dtype=number)
 
@@ -351,9 +366,9 @@ def _binning_kernels(short: bool) -> tuple[Any, Any]:
     ):  # fmt: skip
         """Write one sort key, tile x N + rank, for each tile that a primitive reaches; one thread per rank.
 
-        N is the number of primitives; the rank is a primitive's place in the order of depth. Also fills ``first``,
-        ``slots`` and ``which`` for :func:`bin_primitives`. ``tiles`` is the number of tiles per image, or 0 for one
-        image.
+        N is the number of primitives. The rank of a primitive is its position in the order of depth. The kernel also
+        fills ``first``, ``slots`` and ``which``, see :func:`bin_primitives`. ``tiles`` is the number of tiles per image
+        if there are several images, else 0.
         """
         rank = wp.tid()
         i = int(order[rank])
@@ -383,7 +398,10 @@ def _binning_kernels(short: bool) -> tuple[Any, Any]:
         keys: Keys, came_from: Longs, order: Longs, ends: Longs2d, which: Ints, tiles: int, each: int,
         starts: Ints, ids: Ints, tile_of: Ints, slots_of: Ints,
     ):  # fmt: skip
-        """Fill the tile lists from sorted keys, one per thread; ``tiles``: tiles of all images, ``each``: of one."""
+        """Fill the tile lists from the sorted ``keys``; each thread handles one key.
+
+        ``tiles`` is the number of tiles of all images, ``each`` the number of tiles of one image.
+        """
         k = wp.tid()
         pairs = int(0)
         if _primitives_fit(ends, keys.shape[0], which):
@@ -419,9 +437,10 @@ def bin_primitives(
 ) -> tuple[TileLists, Tensor, Tensor]:
     """Return a frame's tile lists, and ``slots`` and ``which`` of the primitives that are drawn in float64.
 
-    ``slots`` (N,) has each primitive's float64 row or -1, ``which`` the primitive of each row. ``images`` holds each
-    primitive's image index, (N,) int32, and the number of images; None means one image. ``counts`` and ``counted`` are
-    those of :func:`count_tiles`, other tensors those of :class:`~neuprim.core.render.cuda.prepare.Frame`.
+    ``slots`` (N,) has the float64 row of each primitive, or -1; ``which`` has the primitive of each float64 row.
+    ``images`` holds each primitive's image index, (N,) int32, and the number of images; None means one image.
+    ``counts`` is the argument of :func:`count_tiles` and ``counted`` its result. The other tensors are fields of
+    :class:`~neuprim.core.render.cuda.prepare.Frame`.
     """
     device, N, pairs = rows.device, depth.shape[0], counted.pairs
     across, down = -(-camera.width // L.TILE), -(-camera.height // L.TILE)

@@ -1,9 +1,10 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Native functions of the kernels: operations across a block of threads, and fast loads of array elements.
 
-Every thread of a block must call a block operation. On the CPU, a static buffer replaces the hardware. Indexing in Warp
-allows negative indices and 64-bit strides, so it takes nine instructions to load a span. In loops over hits, indices
-are not negative and arrays are contiguous, so two instructions suffice (:func:`neuprim.core.compute.warp.array`).
+Every thread of a block must call a block operation. On the CPU, a static buffer replaces the hardware operation. Warp's
+own indexing allows negative indices and 64-bit strides, so that loading a span takes nine instructions. In loops over
+hits, indices are not negative and arrays are contiguous (:func:`neuprim.core.compute.warp.array`), so that the loads
+of this module take two instructions.
 """
 
 # annotations must be values, not text: Warp reads them, and cannot look up the local names of a function
@@ -37,8 +38,8 @@ def any_tile_thread(yes: int) -> int:
 def _halving_sums(width: int) -> str:
     """Return native code that sums ``width`` values over a warp: 31 shuffles per 32 values instead of 160.
 
-    Each step keeps half of the values and adds to them those of a partner lane (thread). With m = width/32, lane l ends
-    with the sums l m to l m + m - 1. Loops have constant bounds, so that they are unrolled.
+    In each step, a lane (thread) keeps half of its values and adds the same half of a partner lane. With m = width/32,
+    lane l ends with the sums l m to l m + m - 1. Loops have constant bounds, so that the compiler unrolls them.
     """
     steps = ""
     for bit in (16, 8, 4, 2, 1):
@@ -74,7 +75,7 @@ def _halving_sums(width: int) -> str:
 
 @functools.cache
 def gradient_row_type(width: int) -> Any:
-    """Return the Warp type of a gradient row (gradients of one pair of tile and primitive), ``width`` floats."""
+    """Return the Warp type of a gradient row of ``width`` floats: the gradients of one (tile, primitive) pair."""
     return wp.types.vector(length=width, dtype=wp.float32)
 
 

@@ -1,15 +1,15 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Optical depth of a primitive along one pixel's ray, with gradients: the cpu backend's formulas in Warp.
 
-A chord is the part of a ray inside an ellipsoid. Its optical depth is I = N_p |d| D^p half field. N_p is the integral
-of (1 - u^2)^p over [-1, 1], p the exponent of the edge. |d| is the length of the ray direction whose camera-z is 1. D
-is 1 - |y|^2 at the chord's middle, y in whitened space, where the ellipsoid is the unit sphere. half is half the
-chord's extent along camera z, in units of the longest semi-axis m. field is the mean of m x density without edge,
-weighted by the edge: b2 + sum_k w2_k cos(phase_k) B_p(rate_k).
+A chord is the part of a ray inside an ellipsoid. The optical depth of a chord is I = N_p |d| D^p half field. N_p is the
+integral of (1 - u^2)^p over [-1, 1], p the exponent of the edge. |d| is the length of the ray direction whose camera-z
+is 1. D is 1 - |y|^2 at the chord's middle, y in whitened space, where the ellipsoid is the unit sphere. half is half
+the chord's extent along camera z, in units of the longest semi-axis m. field is the mean of m x density without edge,
+weighted by the edge: b2 + sum_k w2_k cos(phase_k) B_p(rate_k). rate_k is the change of phase_k over half a chord.
 
-Phases are in turns. cos is a polynomial of the phase less whole turns. B_p (:mod:`neuprim.core.model.edge`) is a
-polynomial up to half a turn, and a recursion beyond. The backward pass also needs B_(p+1), as B_p' =
--z B_(p+1)/(2p + 3). Coefficients: tools/fit_polynomials.py.
+Phases are in turns. cos is a polynomial of the phase minus whole turns. B_p(z) (:mod:`neuprim.core.model.edge`) is a
+polynomial for rates up to half a turn, and a recursion beyond. The backward pass also needs B_(p+1), because
+B_p' = -z B_(p+1)/(2p + 3). tools/fit_polynomials.py computes the coefficients.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ def sin_turns(r: float):
 def chord_edge_profiles(edge: int) -> tuple[Function, Function]:
     """Return Warp functions v -> B_p(2 pi v) and v -> (B_p, B_(p+1)) for edge exponent p = ``edge`` and any rate v.
 
-    v is the change of a neuron's phase over half a chord, in turns. B_p is the mean of its cosine on the chord,
-    weighted by the edge, divided by the cosine at the middle.
+    v is the change of a neuron's phase over half a chord, in turns. B_p is the mean of the neuron's cosine over the
+    chord, weighted by the edge weight, divided by the cosine at the chord's middle.
     """
     low, high = _B[edge], _B[edge + 1]
 
@@ -113,7 +113,7 @@ def chord_edge_profiles(edge: int) -> tuple[Function, Function]:
 
 @wp.func
 def opacity_of_depth(I: float):  # type: ignore[no-untyped-def]
-    """Return 1 - exp(-I), I >= 0; by a series for small I, where the difference would lose digits."""
+    """Return 1 - exp(-I) for I >= 0; for small I, sum a series, because the difference would lose digits."""
     if I < 0.25:
         return I * (((((-I / 720.0 + 1.0 / 120.0) * I - 1.0 / 24.0) * I + 1.0 / 6.0) * I - 0.5) * I + 1.0)
     return 1.0 - wp.exp(-I)
@@ -136,19 +136,19 @@ class Chord:
     """The part of a pixel's ray inside a primitive, in whitened space (where the primitive is the unit sphere).
 
     t is the position on the ray: t + ``slide`` is the depth beyond the anchor, in units of the longest semi-axis.
-    ``mid`` is t at the chord's middle, ``half`` half of its range of t.
+    ``mid`` is t at the chord's middle, and ``half`` is half of the chord's range of t.
     """
 
     du: float  # pixel offset from the anchor
     dv: float
     slide: float
-    e: wp.vec3  # direction
-    x: wp.vec3  # closest point
+    e: wp.vec3  # direction of the ray
+    x: wp.vec3  # point of the ray closest to the ellipsoid's centre
     D: float  # 1 - |x|^2
     ia: float  # 1/(e.e)
     tm: float  # t of the closest point
     h: float  # half chord before the near plane cuts it
-    uncut: float  # 1 if the near plane does not cut it
+    uncut: float  # 1 if the near plane does not cut the chord, else 0
     mid: float
     half: float  # 0 where the ray misses
 
@@ -160,7 +160,7 @@ def xyz(a: wp.vec4):
 
 @wp.func
 def neuron_phase(q: wp.vec3, w: wp.vec4):
-    """Return a neuron's phase at ``q``, in turns; ``w`` is (WX, WY, WZ, PHASE). It takes three fused multiply-adds."""
+    """Return a neuron's phase at point ``q``, in turns, by three fused multiply-adds; ``w`` is (WX, WY, WZ, PHASE)."""
     return w[3] + q[0] * w[0] + q[1] * w[1] + q[2] * w[2]
 
 
@@ -205,7 +205,7 @@ def intersect_chord(r: Ray, px: float, py: float):
 
 @wp.struct
 class Pull:
-    """The gradient dL/d(origin m, direction e) of a ray."""
+    """Gradients of the loss by a ray's origin m and direction e."""
 
     m: wp.vec3
     e: wp.vec3
@@ -217,8 +217,9 @@ def chord_ends_backward(
 ):
     """Return dL/dm and dL/de of a ray with origin m and direction e, from the gradients of its chord.
 
-    ``gq`` is dL/d(chord's middle point), and ``gv`` dL/d(half e). The other arguments are gradients by the half chord,
-    by t of the middle and of the closest point (tm), by D = 1 - |x|^2 and by a = e.e; ``gD`` includes dL/dh dh/dD.
+    ``gq`` is dL/d(chord's middle point), and ``gv`` is dL/d(half e). ``g_half``, ``g_mid`` and ``g_tm`` are the
+    gradients by the half chord, by t of the chord's middle and by t of the closest point x. ``gD`` is the gradient by
+    D = 1 - |x|^2, including dL/dh dh/dD, and ``gA`` the gradient by a = e.e.
     """
     gt1 = 0.5 * (g_mid + g_half)
     gt0 = 0.5 * (g_mid - g_half) * c.uncut
@@ -235,7 +236,10 @@ def chord_ends_backward(
 
 @wp.func
 def chord_backward(c: Chord, g_half: float, g_mid: float, gD: float, by_depth: float, gq: wp.vec3, gv: wp.vec3):
-    """Like :func:`chord_ends_backward`, with ``by_depth`` = dh/dD given apart, and no gradients by tm and a = e.e."""
+    """Like :func:`chord_ends_backward`, for chords without gradients by tm and by a = e.e.
+
+    ``gD`` excludes dL/dh dh/dD, which this function adds with ``by_depth`` = dh/dD.
+    """
     gt1 = 0.5 * (g_mid + g_half)
     gt0 = 0.5 * (g_mid - g_half) * c.uncut
     return chord_ends_backward(c, g_half, g_mid, 0.0, gD + (gt1 - gt0) * by_depth, 0.0, gq, gv)
@@ -243,7 +247,10 @@ def chord_backward(c: Chord, g_half: float, g_mid: float, gD: float, by_depth: f
 
 @wp.func
 def pixel_of_lane(lane: int):
-    """Return (x, y) in the tile for thread ``lane``: a warp covers 8 x 4 pixels, which small primitives fill better."""
+    """Return the pixel (x, y) in the tile that thread ``lane`` computes.
+
+    A warp covers 8 x 4 pixels, because a small primitive fills such a block better than two rows of 16 pixels.
+    """
     return wp.vec2i((lane & 7) | ((lane >> 2) & 8), ((lane >> 3) & 3) | ((lane >> 4) & 12))
 
 
@@ -251,8 +258,8 @@ def pixel_of_lane(lane: int):
 def slot_of_pixel(span: int, offset: int, x: int):
     """Return the slot of pixel x in a tile row of a (tile, primitive) pair; -1 outside the row's span.
 
-    ``span`` is start << 8 | last << 4 | first: covered pixels in earlier rows, last and first covered pixel. ``offset``
-    is the pair's first slot.
+    ``span`` is start << 8 | last << 4 | first: the number of covered pixels in earlier rows, the last and the first
+    covered pixel of the row. ``offset`` is the pair's first slot.
     """
     slot = int(-1)
     if x >= (span & 15) and x <= ((span >> 4) & 15):
@@ -262,7 +269,7 @@ def slot_of_pixel(span: int, offset: int, x: int):
 
 @wp.func
 def pixel_of_slot(spans: Any, n: int, s: int):
-    """Return (x, y) in the tile of slot ``s`` of pair ``n``, counted from the pair's first slot.
+    """Return the pixel (x, y), in its tile, of slot ``s`` of pair ``n``; ``s`` counts from the pair's first slot.
 
     ``spans`` has 16 row spans per pair (:func:`slot_of_pixel`). y is the last row whose span starts at or before ``s``.
     """

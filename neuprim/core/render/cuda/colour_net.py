@@ -1,9 +1,10 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Evaluate the colour network of each primitive; the CUDA version of :mod:`neuprim.core.render.cpu.colour_net`.
 
-A network maps the middle of a ray's chord to a colour. Its rows are prepared once per primitive, in float64. A slot
-(one pixel of a (tile, primitive) pair) has a hue, the colour before max(0, .), which the forward pass saves. The
-gradient of a network reaches a ray only through the chord's middle, and is added to the gradient row of the density.
+A network maps the middle of a ray's chord to a colour. The row of a network is computed once per primitive, in float64.
+A *hue* is the colour before max(0, .) in one slot (one pixel of a (tile, primitive) pair). The forward pass saves the
+hues. The gradient of a network reaches a ray only through the chord's middle, and is added to the gradient row of the
+density.
 """
 
 import functools
@@ -55,8 +56,8 @@ from neuprim.core.render.cuda.prepare_backward import quaternion_gradient
 from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK, View, project_primitive
 
 FIRST_COLOUR = L.G_NEURONS
-"""First column of a network's gradient row with the C constant colours. The columns of the ray come before, the columns
-(WX, WY, WZ, PHASE, C weights) of each unit after."""
+"""First of the C columns of the constant colour in a network's gradient row. The columns of the ray come before these C
+columns; the columns (WX, WY, WZ, PHASE, C weights) of each unit follow."""
 
 d, f = wp.float64, wp.float32
 _TURNS = wp.constant(d(1.0 / (2.0 * math.pi)))
@@ -72,7 +73,7 @@ class ColourNet:
     bias: Tensor  # (N, H)
     Wout: Tensor  # (N, C, H)
     rows: Tensor  # (N, H rasterizer_net_columns(C), 4) float32, see rasterizer_net_columns
-    fast: Tensor  # (N,) bool, whether a unit turns too fast for float32
+    fast: Tensor  # (N,) bool, whether the phase of a unit changes too fast along a chord for float32
     wide: Tensor  # (M, H, 4) float64 (WX, WY, WZ, PHASE) of the primitives that are drawn in float64
 
     @property
@@ -84,7 +85,8 @@ class ColourNet:
 def _whitened_unit(log_scale: wp.vec3d, quat: wp.vec4d, w: wp.vec3d, phase: wp.float64):
     """Return (WX, WY, WZ, PHASE) of a network unit: frequencies in turns per semi-axis, and the phase in turns.
 
-    ``w`` are its frequencies on scene axes, in radians per longest semi-axis, and ``phase`` its phase in radians.
+    ``w`` holds the unit's frequencies on scene axes, in radians per longest semi-axis; ``phase`` is the unit's phase in
+    radians.
     """
     p = project_primitive(wp.vec3d(), log_scale, quat, View())
     on_axes = _TURNS * wp.cw_mul(p.axes, wp.transpose(p.local) * w)
@@ -94,7 +96,7 @@ def _whitened_unit(log_scale: wp.vec3d, quat: wp.vec4d, w: wp.vec3d, phase: wp.f
 
 @functools.cache
 def _colour_net_kernels(double: bool) -> tuple[Any, Any, Any]:
-    """Return the kernels ``fill_rows``, ``prepare_wide`` and ``backward``, for float64 (``double``) or float32."""
+    """Return the kernels ``fill_rows``, ``prepare_wide`` and ``backward``; parameters are float64 if ``double``."""
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
@@ -134,7 +136,8 @@ def _colour_net_kernels(double: bool) -> tuple[Any, Any, Any]:
     ):  # fmt: skip
         """Compute the parameter gradients of the colour networks; thread i handles primitive i.
 
-        A primitive is visible if ``weights[i, G_WEIGHT]`` > 0. Adds to g_log_scales and g_quats; overwrites the others.
+        ``weights`` are the gradient rows of the density. If ``weights[i, G_WEIGHT]`` is 0, the primitive is not visible
+        and has zero gradients. The kernel adds to g_log_scales and g_quats, and overwrites the other gradients.
         """
         i = wp.tid()
         seen = weights[i, wp.static(L.G_WEIGHT)] > f(0.0)
@@ -181,7 +184,10 @@ def _kernel_types(double: bool) -> tuple[Any, Any, Any]:
 def prepare_rasterizer_colour_net(
     log_scales: Tensor, quats: Tensor, Wx: Tensor, bias: Tensor, Wout: Tensor
 ) -> ColourNet:
-    """Return all primitives' colour networks as float32 rows. ``wide`` stays empty until :func:`fill_wide_net`."""
+    """Return the colour networks of all primitives with their float32 rows.
+
+    The field ``wide`` stays empty until :func:`fill_wide_net` fills it.
+    """
     tensors = (log_scales, quats, Wx, bias, Wout)
     double = any(x.dtype == torch.float64 for x in tensors)
     dtype = torch.float64 if double else torch.float32
@@ -222,7 +228,7 @@ def colour_net_backward(
     """Return the float32 gradients of Wx, bias and Wout; add the gradients of log_scales and quats to ``out``.
 
     ``parameters`` and ``out`` are the tensors of :data:`~neuprim.core.render.rasterize.PARAMETERS` and their gradients.
-    ``weights`` has the (N, ...) gradient rows of the density, ``grads`` those of the networks, one per primitive.
+    ``weights`` holds the gradient rows of the density, ``grads`` the gradient rows of the networks; both have N rows.
     """
     _, log_scales, quats, *_ = parameters
     _, g_log_scales, g_quats, *_ = out
@@ -252,7 +258,10 @@ def net_gradient_row_width(form: KernelForm) -> int:
 
 @functools.cache
 def rasterizer_net_gradient_kernel(form: KernelForm) -> Any:
-    """Return a kernel, one warp per pair, for gradients of colour networks and, through chord middles, of the rays."""
+    """Return a kernel that computes the gradients of colour networks and, through the chords' middles, of the rays.
+
+    One warp handles one (tile, primitive) pair.
+    """
     C, H, P = form.channels, form.hidden, form.edge
     each, width = L.rasterizer_net_columns(C), net_gradient_row_width(form)
     columns, net_columns = L.rasterizer_row_columns(form.neurons, C), max(H * each, 1)
@@ -328,14 +337,17 @@ def rasterizer_net_gradient_kernel(form: KernelForm) -> Any:
 
 @functools.cache
 def float64_hues_kernel(channels: int) -> Any:
-    """Return a kernel that computes, in float64, the hues (colours before max(0, .)) of the slots of float64 pairs."""
+    """Return a kernel that computes the hues (colours before max(0, .)) of float64 pairs in all their slots."""
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def float64_hues(
         pairs: Ints, wide: Doubles2d, net: Vec4ds2d, mixes: Vec4s2d, rows: Vec4s2d, first: int, hidden: int,
         slots: Ints, ids: Ints, tiles: Ints, spans: Shorts2d, offsets: Ints, size: wp.vec2i, hues: Floats2d,
     ):  # fmt: skip
-        """Fill ``hues``. Units' output weights are in ``mixes``, constant colours in ``rows`` from column ``first``."""
+        """Fill ``hues`` in the slots of ``pairs``, one warp per pair.
+
+        ``mixes`` holds the output weights of the units; ``rows`` holds constant colours from column ``first``.
+        """
         member, lane = wp.tid()
         n = pairs[member]
         i, r = ids[n], slots[ids[n]]

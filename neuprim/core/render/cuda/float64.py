@@ -1,9 +1,10 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """The pixel stage in float64, for the few primitives for which float32 is not accurate enough.
 
-It computes chords, opacities and gradients. The formulas are those of :mod:`neuprim.core.render.cpu.float64`; a hard
-edge has the weight q = 1. Opacities and entries (depths at which rays enter) are stored in the slots (pixels of pairs)
-before compositing. For gradients of edges see :func:`neuprim.core.render.cpu.gradients.chord_gradient`.
+The pixel stage computes chords, opacities and gradients. The formulas are those of
+:mod:`neuprim.core.render.cpu.float64`; the edge weight q of a hard edge is 1. Before compositing, opacities and entries
+(depths at which rays enter the primitive) are stored in the slots (pixels of (tile, primitive) pairs). For the
+gradients of soft edges see :func:`neuprim.core.render.cpu.gradients.chord_gradient`.
 """
 
 from __future__ import annotations
@@ -28,7 +29,10 @@ _TERMS = 14
 
 @wp.struct
 class Chord64:
-    """A :class:`~neuprim.core.render.cuda.chord.Chord` (part of a ray in a primitive) in float64; it has no slide."""
+    """A :class:`~neuprim.core.render.cuda.chord.Chord` (part of a ray in a primitive) in float64.
+
+    Unlike in float32, the ray's origin is not slid along the ray.
+    """
 
     du: wp.float64
     dv: wp.float64
@@ -51,7 +55,7 @@ def _wide_row_vector(wide: Doubles2d, r: int, c: int):
 
 @wp.func
 def intersect_chord64(wide: Doubles2d, r: int, X: int, Y: int):
-    """Return the chord (part inside the primitive) of pixel (X, Y)'s ray; ``r`` is the primitive's row in ``wide``."""
+    """Return the chord of the ray through pixel (X, Y) in the primitive whose row in ``wide`` is ``r``."""
     c = Chord64()
     zero, one = d(0.0), d(1.0)
     c.du = d(X) + d(0.5) - wide[r, W.UX]
@@ -76,10 +80,10 @@ def intersect_chord64(wide: Doubles2d, r: int, X: int, Y: int):
 
 @wp.struct
 class Weight:
-    """The edge weight q(u) along a chord, u from -1 to 1, and its derivative.
+    """The edge weight q(u) along a chord, u from -1 to 1, and the derivative of q.
 
-    ``q`` has the coefficients of the polynomial, lowest power first, and ``mean`` its mean. dq/d(1 - |y|^2) is
-    b0 + b1 u + b2 u^2.
+    ``q`` holds the coefficients of the polynomial q(u), lowest power first. ``mean`` is the mean of q(u) over the
+    chord. dq/d(1 - |y|^2) is b0 + b1 u + b2 u^2, y the point in whitened space.
     """
 
     q: vec5d
@@ -121,7 +125,10 @@ def chord_edge_polynomial64(c: Chord64, edge: int):
 
 @wp.func
 def _chord_bessel(z: wp.float64):
-    """Return the spherical Bessel functions j_0 to j_5 at any z; by a series below 2, where recursion loses digits."""
+    """Return the spherical Bessel functions j_0 to j_5 at any z.
+
+    For |z| < 2, where upward recursion loses digits, the function sums a series.
+    """
     j = vec6d()
     if wp.abs(z) < d(2.0):
         square, power = d(0.5) * z * z, d(1.0)
@@ -145,7 +152,7 @@ def _chord_bessel(z: wp.float64):
 
 @wp.func
 def chord_moments(z: wp.float64):
-    """Return six means over u in [-1, 1], for n = 0 to 5: of u^n cos(z u) if n is even, of u^n sin(z u) if n is odd."""
+    """Return the means over u in [-1, 1] of u^n cos(z u) for n = 0, 2, 4 and of u^n sin(z u) for n = 1, 3, 5."""
     j = _chord_bessel(z)
     two, three, eight = d(2.0), d(3.0), d(8.0)
     M = vec6d()
@@ -167,7 +174,7 @@ def chord_phase64(c: Chord64, w: wp.vec3d, phase: wp.float64):
 
 @wp.func
 def rate64(c: Chord64, w: wp.vec3d):
-    """Return z, a neuron's phase change over half a chord, in radians."""
+    """Return z, the change of a neuron's phase over half a chord, in radians."""
     return d(_TWO_PI) * c.half * wp.dot(c.e, w)
 
 
@@ -194,7 +201,7 @@ def weighted_moments64(w: Weight, M: vec6d):
 
 @wp.struct
 class Pull64:
-    """Gradients of the loss by a ray's origin m, direction e and G = du EX + dv EY, the part of e = E0 + G."""
+    """Gradients of the loss by a ray's origin m, by its direction e = E0 + G, and by G = du EX + dv EY."""
 
     m: wp.vec3d
     e: wp.vec3d
@@ -207,10 +214,11 @@ def chord_backward64(
     gD: wp.float64, gA: wp.float64,
     gq: wp.vec3d, gv: wp.vec3d,
 ):  # fmt: skip
-    """Return the gradient of a ray from the gradients of its chord, in float64; D is at least ``depth_floor`` in dh/dD.
+    """Return the gradients of a ray from the gradients of its chord, in float64.
 
-    For the arguments see :func:`~neuprim.core.render.cuda.chord.chord_ends_backward`. But ``gD`` excludes dL/dh dh/dD,
-    which is added here. ``tc`` is the anchor's depth / m.
+    For the arguments see :func:`~neuprim.core.render.cuda.chord.chord_ends_backward`. Unlike there, ``gD`` excludes
+    dL/dh dh/dD, which this function adds. In dh/dD, D counts as at least ``depth_floor``. ``tc`` is the anchor's depth
+    divided by the longest semi-axis m.
     """
     half, two = d(0.5), d(2.0)
     gt1, gt0 = half * (g_mid + g_half), half * (g_mid - g_half) * c.uncut
@@ -235,14 +243,20 @@ def ray_norm(lens: wp.vec4, X: int, Y: int):
 
 @functools.cache
 def float64_opacity_kernel(depth: bool) -> Any:
-    """Return a kernel that computes opacities in float64, and with ``depth`` the camera-z of the chords' middles."""
+    """Return a kernel that computes the opacities of float64 pairs.
+
+    With ``depth``, the kernel also computes the camera-z of the chords' middles.
+    """
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def float64_opacity(
         pairs: Ints, wide: Doubles2d, slots: Ints, ids: Ints, tiles: Ints, spans: Shorts2d, offsets: Ints,
         lens: wp.vec4, limits: wp.vec4, size: wp.vec2i, neurons: int, edge: int, hits: Vec2s, depths: Floats,
     ):  # fmt: skip
-        """Store (alpha, entry depth) in slots of ``pairs``, a block each; ``slots``: primitives' rows in ``wide``."""
+        """Store (alpha, entry depth) in the ``hits`` of all slots of ``pairs``, with one block per pair.
+
+        ``slots`` holds the row of each primitive in ``wide``.
+        """
         member, lane = wp.tid()
         n, r = pairs[member], int(-1)
         if n >= 0:  # -1 fills the list
@@ -281,7 +295,10 @@ def float64_opacity_kernel(depth: bool) -> Any:
 
 @functools.cache
 def float64_pairs_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return the kernel for gradient rows of float64 pairs, one warp each; ``depth``: depth images have a gradient."""
+    """Return the kernel that writes the gradient rows of float64 pairs, with one warp per (tile, primitive) pair.
+
+    ``depth`` tells whether the depth image has a gradient.
+    """
     K, P, C = form.neurons, form.edge, form.channels
     width = L.gradient_width(K, C)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)

@@ -1,10 +1,11 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Forward pass of compositing: one block per tile, one thread per pixel; two passes for ``sort = "entry"``.
 
-Primitives' rows are loaded into shared memory in batches. A tile is finished when T < T_min in all of its pixels, T the
-transmittance. A slot is memory for one pixel of a (tile, primitive) pair
-(:func:`~neuprim.core.render.cuda.slots.row_spans`). A hit (a primitive on a pixel's ray) stores (alpha, T before it) in
-its slot. The slots of primitives drawn in float64 already contain opacities (:mod:`~neuprim.core.render.cuda.float64`).
+The rows of primitives are loaded into shared memory in batches. A tile is finished when the transmittance T is below
+T_min in all of its pixels. A slot is memory for one pixel of a (tile, primitive) pair
+(:func:`~neuprim.core.render.cuda.slots.row_spans`). A hit is a primitive on a pixel's ray. The slot of a hit stores the
+opacity alpha and T in front of the hit. For primitives that are drawn in float64, slots already contain opacities
+(:mod:`~neuprim.core.render.cuda.float64`).
 """
 
 from __future__ import annotations
@@ -68,11 +69,12 @@ BATCH = 16  # rows in shared memory at a time
 
 @functools.cache
 def forward_kernel(form: KernelForm, keep: bool, depth: bool, listing: bool = False, several: bool = False) -> Any:
-    """Return the compositing kernel for a form of primitives.
+    """Return the compositing kernel for primitives of the given ``form``.
 
-    With ``keep``, it fills the slots (saved data of hits), and reads float64 primitives from slots. With ``depth``, it
-    also computes the sum of weight x depth. With ``listing``, it only lists key and pair of every hit, for
-    :func:`composite_kernel`. With ``several``, there is more than one image.
+    With ``keep``, the kernel fills the slots (saved data of hits), and reads the opacities of float64 primitives from
+    slots. With ``depth``, the kernel also computes the sum of weight x depth. With ``listing``, the kernel does not
+    composite; it lists the sort key and the pair of every hit, for :func:`composite_kernel`. With ``several``, there is
+    more than one image.
     """
     assert (keep or not listing) and not (listing and several)
     K, P, C = form.neurons, form.edge, form.channels
@@ -91,7 +93,7 @@ def forward_kernel(form: KernelForm, keep: bool, depth: bool, listing: bool = Fa
         limits: wp.vec4, background: Floats, size: wp.vec2i, rgb: Floats2d, transmittance: Floats, zsum: Floats,
         hits: Vec2s, depths: Floats, hues: Floats2d, reached: Ints, keys: Longs, owners: Ints,
     ):  # fmt: skip
-        """Composite one tile per block; set ``reached[tile]`` to the end of the pairs that were composited.
+        """Composite one tile per block; set ``reached[tile]`` to the index after the last composited pair.
 
         ``limits`` holds alpha_min, alpha_max, transmittance_min and an unused number.
         """
@@ -236,7 +238,7 @@ def forward_kernel(form: KernelForm, keep: bool, depth: bool, listing: bool = Fa
 
 @wp.func
 def _first_hit_of_pixel(keys: Longs, count: int, pixel: int):
-    """Return the index of the first sorted key that belongs to this pixel or a later one."""
+    """Return the index of the first sorted key that belongs to ``pixel`` or to a later pixel."""
     low, high = int(0), int(count)
     while low < high:
         middle = low + (high - low) // 2
@@ -249,7 +251,10 @@ def _first_hit_of_pixel(keys: Longs, count: int, pixel: int):
 
 @functools.cache
 def composite_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return a kernel that composites hits sorted by entry, one thread per pixel, and writes (alpha, T before them)."""
+    """Return a kernel that composites hits sorted by entry, with one thread per pixel.
+
+    The kernel writes (alpha, transmittance T in front of the hit) to the slot of each hit.
+    """
     C, H = form.channels, form.hidden
     colours = L.rasterizer_colour_column(form.neurons)
     colour_type = wp.types.vector(length=C, dtype=wp.float32)
@@ -260,7 +265,7 @@ def composite_kernel(form: KernelForm, depth: bool) -> Any:
         background: Floats, hues: Floats2d, depths: Floats, hits: Vec2s, rgb: Floats2d, transmittance: Floats,
         zsum: Floats, begins: Ints,
     ):  # fmt: skip
-        """Composite pixel n's sorted hits, a thread per pixel; ``begins[n]`` is the first of its hits in ``order``."""
+        """Composite the sorted hits of pixel n in thread n; set ``begins[n]`` to the pixel's first hit in ``order``."""
         n = wp.tid()
         first = _first_hit_of_pixel(keys, count, n)
         begins[n] = first
@@ -310,17 +315,17 @@ class CompositedFrame:
 
     rgb: Tensor  # (H W, C)
     transmittance: Tensor  # (H W,)
-    zsum: Tensor  # (H W,) sum of w z, empty without depth
-    spans: Tensor  # (pairs, 16) int16; with the offsets, the pixels of each pair, see row_spans
-    offsets: Tensor  # (pairs + 1,) int32
-    hits: Tensor  # (slots, 2) opacity and transmittance before it, if slots are kept
-    depths: Tensor  # (slots,) camera-z, empty without depth
-    hues: Tensor  # (slots, C) colours before max(0, .), of colour networks
-    reached: Tensor  # (tiles,) int32, the pairs before it were composited
+    zsum: Tensor  # (H W,) sum over hits of weight x depth, empty without depth
+    spans: Tensor  # (pairs, 16) int16 row spans: the pixels of each pair, see row_spans
+    offsets: Tensor  # (pairs + 1,) int32, first slot of each pair
+    hits: Tensor  # (slots, 2) opacity of each hit and transmittance in front of it; empty if no slots are kept
+    depths: Tensor  # (slots,) camera-z of the chords' middles, empty without depth
+    hues: Tensor  # (slots, C) colours before max(0, .); empty without colour networks
+    reached: Tensor  # (tiles,) int32, index after the last composited pair of each tile
     in_float64: Tensor  # (D,) int32, the pairs that are drawn in float64, in order
     # only if hits were sorted by entry:
-    order: Tensor | None = None  # (slots,) int64 slots by pixel and entry
-    begins: Tensor | None = None  # (H W + 1,) int32, first of each pixel
+    order: Tensor | None = None  # (slots,) int64 slots, sorted by pixel and entry
+    begins: Tensor | None = None  # (H W + 1,) int32, index in order of each pixel's first hit
     owners: Tensor | None = None  # (slots,) int32, pair of each slot
 
 
@@ -330,11 +335,11 @@ def warp_array(tensor: Tensor) -> Any:
 
 
 class KernelArrays:
-    """Arrays and numbers of a frame as arguments of kernels.
+    """Arrays and numbers of a frame, in the form that kernels take as arguments.
 
     ``lens`` is (fx, fy, cx, cy), ``size`` is (width, height), ``limits`` is
     (alpha_min, alpha_max, transmittance_min, 0). ``units`` are the rows of colour networks. ``spans`` and ``offsets``
-    are those of :class:`CompositedFrame`, other arrays those of :class:`Frame`.
+    are fields of :class:`CompositedFrame`; the other arrays are fields of :class:`Frame` and of its tile lists.
     """
 
     def __init__(
@@ -368,9 +373,10 @@ def composite_frame(
     images: int = 1,
     capacity: FrameCapacity | None = None,
 ) -> CompositedFrame:
-    """Composite a frame to one image, or to several (without gradients, sorted by centres).
+    """Composite a frame to one image or several ``images``; several images have no gradients and no entry sorting.
 
-    Waits for the device if slots (memory for backward, float64 or sorting) are needed and there is no ``capacity``.
+    The backward pass, float64 and sorting by entry need slots. If slots are needed and there is no ``capacity``, the
+    function waits for the device.
     """
     lists, device, camera = frame.lists, frame.device, frame.projection.camera
     pairs, tiles = lists.pairs, lists.starts.shape[0] - 1

@@ -26,8 +26,8 @@ E0, EX, EY, XA, XU, XV, REST, NEURONS = 0, 1, 2, 3, 4, 5, 6, 7
 REST holds four scalars. The neurons' columns come after REST."""
 
 SCALARS = {E0: "UX", EX: "UY", EY: "NEAR", XA: "OFFSET", XU: "TU", XV: "TV"}
-"""The fourth number of each column. REST holds TC, UNIT, ANCHOR_Z and whether the primitive needs float64 (0 or 1); a
-neuron's column holds (WX, WY, WZ, PHASE)."""
+"""Names of the scalar, the fourth number, of each column. REST holds TC, UNIT, ANCHOR_Z and whether the primitive needs
+float64 (0 or 1). The column of a neuron holds (WX, WY, WZ, PHASE)."""
 
 AMPLITUDE = 4  # place of the amplitude among the five numbers of a neuron in a gradient row
 
@@ -38,12 +38,12 @@ CUT_AT = -1e30  # entry of every chord that the near plane cuts: in front of all
 
 @dataclass(frozen=True)
 class KernelForm:
-    """Constants of a compiled kernel: neurons K, edge exponent p, channels C, hidden units H (-1: constant colours)."""
+    """Constants with which a kernel is compiled."""
 
-    neurons: int
-    edge: int
-    channels: int
-    hidden: int = -1
+    neurons: int  # K, neurons of the density
+    edge: int  # p, exponent of the density's edge
+    channels: int  # C, colour channels
+    hidden: int = -1  # H, hidden units of a colour network; -1 for constant colours
 
 
 def rasterizer_amplitude_column(neurons: int) -> int:
@@ -62,7 +62,10 @@ def rasterizer_row_columns(neurons: int, channels: int) -> int:
 
 
 def wide_width(neurons: int) -> int:
-    """Return the length of a primitive's float64 ("wide") row: the columns of the cpu backend without padding."""
+    """Return the length of a primitive's float64 ("wide") row.
+
+    The row has the columns of :mod:`neuprim.core.render.layout`, without padding.
+    """
     return layout.NEURONS + PER_NEURON * neurons
 
 

@@ -1,8 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Arrays of a frame on the device, and the kernel that projects primitives: one thread per primitive, in float64.
 
-This is the CUDA version of :mod:`neuprim.core.render.cpu.prepare`. Rows consist of float4 and include colours. Neurons
-stay in the order of the model. The kernel also counts the tiles that each primitive reaches.
+This is the CUDA version of :mod:`neuprim.core.render.cpu.prepare`. Unlike there, rows consist of float4 columns and
+include colours, and neurons stay in the order of the model. The kernel also counts the tiles that each primitive
+reaches.
 """
 
 import functools
@@ -93,7 +94,10 @@ def _largest_ray_component(v: wp.vec3d):
 
 @wp.func
 def _projected_frequency(w: wp.vec3d, p: ProjectedPrimitive, turns: wp.float64):
-    """Return a neuron's frequencies ``w`` on the ellipsoid's axes, in turns per semi-axis; ``turns``: omega0 / 2 pi."""
+    """Return a neuron's frequencies ``w`` converted to the ellipsoid's axes, in turns per semi-axis.
+
+    ``turns`` is omega0 / 2 pi.
+    """
     t = wp.transpose(p.local) * w
     return wp.vec3d(turns * p.axes[0] * t[0], turns * p.axes[1] * t[1], turns * p.axes[2] * t[2])
 
@@ -102,9 +106,10 @@ def _projected_frequency(w: wp.vec3d, p: ProjectedPrimitive, turns: wp.float64):
 def project_primitives_kernel(double: bool) -> Any:
     """Return a kernel that fills rows, spans, boxes, depth, status and counts of every primitive; launch size (N,).
 
-    Arrays are those of :class:`Frame`. Row 0 of ``counts`` (2, N) is the number of tiles reached, row 1 is 1 for
-    visible primitives that need float64. ``bad`` (1,) is the first primitive that is not finite, colours included.
-    Samples of less optical depth than ``least`` are skipped. ``forced`` primitives need float64.
+    The arrays are those of :class:`Frame`. Row 0 of ``counts`` (2, N) is the number of tiles that each primitive
+    reaches; row 1 is 1 for visible primitives that need float64. ``bad`` (1,) is the first primitive that has
+    parameters or colours that are not finite. A primitive is not drawn where its optical depth cannot reach ``least``.
+    Primitives marked in ``forced`` always need float64.
     """
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
@@ -302,7 +307,10 @@ def wide_kernel(double: bool) -> Any:
 
 
 class NotFinitePrimitive(ValueError):
-    """Primitive ``row`` has values that are NaN, infinite or outside float32; the caller reports which ones."""
+    """Error: primitive ``row`` has values that are NaN, infinite or outside the range of float32.
+
+    The caller finds and reports these values.
+    """
 
     def __init__(self, row: int) -> None:
         super().__init__(f"primitive {row} is not finite")
@@ -311,7 +319,7 @@ class NotFinitePrimitive(ValueError):
 
 @dataclass(frozen=True)
 class Projection:
-    """A camera view as argument of the kernels."""
+    """A camera view, in the form that the kernels take as arguments."""
 
     matrix: Tensor  # (16,) float64 on the device, world to camera
     camera: Camera  # focal lengths and centre in pixels, size
@@ -329,9 +337,11 @@ class Frame:
 
     projection: Projection  # the view
     parameters: tuple[Tensor, ...]  # tensors of PARAMETERS, contiguous, all float32 or all float64
-    rows: Tensor  # (N, columns(K, C), 4) float32
-    wide: Tensor  # (M, wide_width(K)) float64, rows of the primitives in float64, columns of layout
-    slots: Tensor  # (N,) int32, row in wide, or -1
+    rows: Tensor  # (N, rasterizer_row_columns(K, C), 4) float32
+    # (M, wide_width(K)) float64, rows of the primitives that are drawn in float64; columns as in
+    # neuprim.core.render.layout
+    wide: Tensor
+    slots: Tensor  # (N,) int32, each primitive's row in wide, or -1
     which: Tensor  # (M,) int32, primitive of each row of wide, in order
     spans: Tensor  # (N, 8) float32, silhouettes
     boxes: Tensor  # (N, 4) int32, pixel boxes x0, y0, x1, y1
@@ -374,15 +384,18 @@ def prepare_frame(
     forced: Tensor | None = None,
     images: tuple[Tensor, int] | None = None,
 ) -> Frame:
-    """Return the data of one view for the pixel kernels; waits for the device once if ``request`` has no capacity.
+    """Return the data of one view that the pixel kernels read.
+
+    If ``request`` has no capacity, the function waits for the device once, to read the sizes of the arrays.
 
     Args:
         palette: (N, C) colours.
         tensors: the tensors that :data:`~neuprim.core.render.rasterize.PARAMETERS` names, all on one device.
-        forced: (N,) bool, primitives that are always rendered in float64.
+        forced: (N,) bool, True for primitives that are always rendered in float64.
         images: (N,) int32 index of the image of each primitive, and the number of images; None for one image.
 
-    Raises NotFinitePrimitive, or BackendUnavailable if primitives reach 2^31 tiles or more.
+    Raises NotFinitePrimitive for values that are not finite, and BackendUnavailable if there are 2^31 or more (tile,
+    primitive) pairs.
     """
     # float64 if any tensor is, else float32; the kernels compute in float64 in any case
     dtype = torch.float64 if any(x.dtype == torch.float64 for x in tensors) else torch.float32

@@ -1,5 +1,8 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Compute gradients of parameters and camera from gradient rows, one thread per primitive, as in the cpu backend."""
+"""Compute gradients of parameters and camera from gradient rows, with one thread per primitive.
+
+The formulas are those of :mod:`neuprim.core.render.cpu.prepare_backward`.
+"""
 
 import functools
 from typing import Any
@@ -36,7 +39,10 @@ def _load_gradient_vector(grads: Floats2d, i: int, column: int):
 
 @wp.func
 def quaternion_gradient(q: wp.vec4d, n: wp.float64, g: wp.mat33d):
-    """Return dL/dq from ``g`` = dL/dR, R the rotation of q; ``n`` is 1/|q|. The result is perpendicular to q."""
+    """Return dL/dq of a quaternion q from ``g`` = dL/dR, R the rotation matrix of q; ``n`` is 1/|q|.
+
+    The result is perpendicular to q, because R does not depend on the length of q.
+    """
     two = d(2.0)
     w, x, y, z = q[0] * n, q[1] * n, q[2] * n, q[3] * n
     gw = two * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
@@ -130,8 +136,8 @@ def _prepare_backward_kernel(double: bool) -> Any:
 def prepare_backward(frame: Frame, grads: Tensor, want_view: bool = False) -> tuple[tuple[Tensor, ...], Tensor | None]:
     """Return float32 gradients of the parameters, and with ``want_view`` the (3, 4) float64 gradient of (R | t).
 
-    (R | t) is the camera's rotation and translation. ``grads`` are the (N, gradient_width) float32 gradient rows of the
-    pixel stage; a row with weight 0 gives zero gradients.
+    (R | t) is the camera's rotation and translation. ``grads`` are the (N, gradient_width) float32 gradient rows that
+    the pixel kernels write. A row whose column G_WEIGHT is 0 gives zero gradients.
     """
     out = tuple(torch.empty(x.shape, dtype=torch.float32, device=x.device) for x in frame.parameters)
     g_view = torch.empty(grads.shape[0], 12, dtype=torch.float64, device=grads.device) if want_view else None

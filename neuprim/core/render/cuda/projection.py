@@ -5,12 +5,12 @@ from neuprim.core.compute.warp import OPTIONS, Doubles, wp
 from neuprim.core.render.layout import ANCHOR_RADII
 
 EXACT = {**OPTIONS, "fuse_fp": False}
-"""Options of the per-primitive kernels: every product is rounded (no fused multiply-add), so that two kernels that
-count the same tiles, and the CPU, agree."""
+"""Options of the per-primitive kernels. Every product is rounded (no fused multiply-add), so that kernels that count
+the same tiles agree with each other and with the CPU."""
 
 PER_BLOCK = 64
-"""Primitives per block: float64 takes 163 registers, and a few more small blocks fit on a multiprocessor than large
-ones."""
+"""Threads per block, one per primitive. A float64 thread takes 163 registers, so that small blocks fill a
+multiprocessor better than large blocks."""
 
 d = wp.float64
 _ANCHOR_RADII = wp.constant(d(ANCHOR_RADII))
@@ -31,9 +31,10 @@ class View:
 class ProjectedPrimitive:
     """An ellipsoid in a view: orientation, semi-axes, centre, and anchor pixel.
 
-    The columns of ``B`` and ``local`` are its axes in camera and in scene axes. ``m`` is the longest semi-axis,
-    ``axes`` has all semi-axes / m. ``centre`` is in camera axes, scene units. ``anchor`` (depth, x, y) is the depth of
-    the centre and the pixel that shows it (:func:`project_primitive`). ``inverse`` is 1/|quaternion|.
+    The columns of ``B`` and ``local`` are the directions of the ellipsoid's axes, in camera and in scene axes. ``m`` is
+    the longest semi-axis, ``axes`` has all semi-axes / m. ``centre`` is in camera axes, scene units. ``anchor``
+    (depth, x, y) is the depth of the centre and the pixel that shows the centre, but see :func:`project_primitive` for
+    primitives near or behind the camera. ``inverse`` is 1/|quaternion|.
     """
 
     B: wp.mat33d
@@ -50,10 +51,10 @@ class Ray:
     """The rays of all pixels through a primitive, in whitened space, where the ellipsoid is the unit sphere.
 
     For pixel offset (du, dv) from the anchor, let G = du ex + dv ey and s = du tu + dv tv. The ray is x(t) =
-    (xa + du xu + dv xv + s G) + t (e0 + G), with xu = tc ex + tu e0, xv = tc ey + tv e0 and t in units of the longest
-    semi-axis m. A = m S^-1 B^T converts camera axes to whitened axes, S the semi-axes. ``ref`` is the direction to the
-    anchor with camera-z 1. ``w`` is (anchor - centre)/m in camera axes. ``tc`` is the anchor's depth / m, ``near`` is t
-    at the near plane.
+    (xa + du xu + dv xv + s G) + t (e0 + G), with xu = tc ex + tu e0 and xv = tc ey + tv e0. t is in units of the
+    longest semi-axis m. The matrix A = m S^-1 B^T converts camera axes to whitened axes; S is the diagonal matrix of
+    the semi-axes. ``ref`` is the direction to the anchor with camera-z 1. ``w`` is (anchor - centre)/m in camera axes.
+    ``tc`` is the anchor's depth / m, and ``near`` is (depth of the near plane - anchor's depth)/m.
     """
 
     A: wp.mat33d
@@ -91,8 +92,9 @@ def load_projection_view(matrix: Doubles, intrinsics: wp.vec4d, near: wp.float64
 def project_primitive(mean: wp.vec3d, log_scale: wp.vec3d, quat: wp.vec4d, v: View):
     """Return a primitive's orientation, centre and anchor pixel in the view ``v``.
 
-    The anchor shows the centre. If the primitive is near or behind the camera, or before the near plane, the anchor is
-    the principal point, with depth 0. It is rounded *before* its use, so that pixel kernels subtract the same value.
+    The anchor is the pixel that shows the centre. If the primitive is near or behind the camera, or before the near
+    plane, the anchor is the principal point, with depth 0. The anchor is rounded to float32 *before* its use, so that
+    pixel kernels subtract the same value.
     """
     one, two = d(1.0), d(2.0)
     p = ProjectedPrimitive()

@@ -1,7 +1,8 @@
-"""Record frames as CUDA graphs, and replay them when a model is rendered again by a camera with the same intrinsics.
+"""Record frames as CUDA graphs, and replay a graph when a model is rendered again by a camera with the same intrinsics.
 
-The arrays of a recorded frame have fixed sizes. A frame that does not fit, or has numbers that are not finite, is
-rendered again without the recording. That enlarges the arrays, or raises an error that names the cause.
+The arrays of a recorded frame have fixed sizes. If a frame does not fit, or has numbers that are not finite, the
+renderer renders the frame again without the recording. This second rendering enlarges the arrays, or raises an error
+that names the cause.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _MOST_PROGRAMS = 4
 
 @dataclass
 class _Program:
-    """A recorded frame: inputs, result and the function that runs it."""
+    """A recorded frame: the tensors of its inputs, its result, and the function that replays the frame."""
 
     viewmat: Tensor
     background: Tensor | None
@@ -39,7 +40,9 @@ class _Program:
 
 
 class FrameRecorder:
-    """Records the frames of one model as CUDA graphs. If a parameter moves to other memory, recordings are discarded.
+    """Recorder of one model's frames as CUDA graphs.
+
+    If a parameter moves to other memory, the recorder discards its recordings.
 
     Attributes:
         replayed: number of frames that were replayed.
@@ -58,7 +61,7 @@ class FrameRecorder:
         self, model: Primitives, camera: Camera, conditions: Conditions, settings: RenderSettings,
         background: Tensor | None,
     ) -> RenderOutput | None:  # fmt: skip
-        """Return a replayed frame. If None, the caller must render the frame and pass it to :meth:`observe`.
+        """Return a replayed frame; if the result is None, the caller must render the frame and call :meth:`observe`.
 
         A frame is recorded when its intrinsics, settings and shapes repeat and :meth:`observe` has set the array sizes.
         """
@@ -97,7 +100,7 @@ class FrameRecorder:
             return replace(made, rgb=made.rgb.clone(), alpha=made.alpha.clone(), depth=depth)
 
     def observe(self, output: RenderOutput) -> None:
-        """Read the counts of a frame that was not recorded; enlarge the arrays if a count exceeds their capacity."""
+        """Read the counts of a frame that was not replayed; enlarge the arrays if a count exceeds their capacity."""
         with self._turn:
             counts = frame_counts(output.stats)
             if self._capacity is not None and self._capacity.fits(counts):

@@ -1,7 +1,8 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Slots: memory for each pixel of each (tile, primitive) pair, in which the forward pass saves data for backward.
 
-Frames that exceed the array sizes of a :class:`~neuprim.core.render.cuda.binning.FrameCapacity` are emptied here.
+This module also empties the tiles of frames that exceed the array sizes of a
+:class:`~neuprim.core.render.cuda.binning.FrameCapacity`.
 """
 
 import torch
@@ -54,10 +55,10 @@ def row_spans(
 ):  # fmt: skip
     """Write the pixels that each (tile, primitive) pair covers in its tile, as 16 row spans; thread n handles pair n.
 
-    A span is start << 8 | last << 4 | first: first and last covered pixel of the row, and the number of covered pixels
-    in earlier rows. Each covered pixel has a slot for the data of the backward pass, in the order of pairs, rows and
-    pixels. The slots take a fifth of the memory of whole tiles. ``counts`` (2, pairs): row 0 counts slots, row 1
-    float64 pairs.
+    A span is start << 8 | last << 4 | first. ``start`` is the number of covered pixels in earlier rows; ``last`` and
+    ``first`` are the last and first covered pixel of the row. Each covered pixel has a slot for the data of the
+    backward pass, in the order of pairs, rows and pixels. The slots take a fifth of the memory of whole tiles. The
+    kernel also fills ``counts`` (2, pairs): row 0 is the number of slots of each pair, row 1 is 1 for float64 pairs.
     """
     n = wp.tid()
     if n >= starts[starts.shape[0] - 1]:  # the arrays are larger than the frame needs
@@ -100,9 +101,9 @@ def row_spans(
 
 @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
 def list_float64_pairs(starts: Ints, counts: Ints2d, ends: Longs2d, found: Ints):
-    """Write the indices of pairs (a tile and a primitive) that float64 code draws to ``found``, in order.
+    """Write the indices of all (tile, primitive) pairs that are drawn in float64 to ``found``, in order.
 
-    ``counts[1]`` is 1 for these pairs, ``ends`` are the running sums of ``counts``.
+    ``counts[1]`` is 1 for these pairs, and ``ends`` holds the running sums of ``counts``.
     """
     n = wp.tid()
     if counts[1, n] > 0 and n < starts[starts.shape[0] - 1]:  # a refused frame has no pairs
@@ -134,8 +135,9 @@ def refuse_frame(
 def count_slots(frame: Frame, counts: Tensor, capacity: FrameCapacity | None) -> tuple[int, Tensor, Tensor]:
     """Return the number of slots, the (pairs + 1,) first slot of each pair, and a list of the float64 pairs.
 
-    -1 pads the list. ``counts`` (2, pairs) comes from :func:`row_spans`. Waits for the device if there is no
-    ``capacity``. Raises BackendUnavailable if there are too many slots.
+    ``counts`` (2, pairs) comes from :func:`row_spans`. Without a ``capacity``, the function waits for the device. With
+    a ``capacity``, the list has a fixed length, and -1 fills its rest. Raises BackendUnavailable if there are 2^31
+    slots or more.
     """
     device, pairs = frame.device, counts.shape[1]
     ends = running_sums(counts)
@@ -160,7 +162,10 @@ def count_slots(frame: Frame, counts: Tensor, capacity: FrameCapacity | None) ->
 
 
 def refuse_misfit(frame: Frame, slot_ends: Tensor, capacity: FrameCapacity) -> None:
-    """Empty all tiles of a frame that exceeds ``capacity``; ``slot_ends``: running sums of slots and float64 pairs."""
+    """Empty all tiles of a frame that exceeds ``capacity`` or has a primitive that is not finite.
+
+    ``slot_ends`` (2, pairs) holds the running sums of slots and of float64 pairs.
+    """
     starts = frame.lists.starts
     sizes = wp.vec4i(*capacity.sizes)
     sums = (array(frame.ends, wp.int64), array(slot_ends, wp.int64), array(frame.bad, wp.int32))

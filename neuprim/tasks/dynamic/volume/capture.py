@@ -1,8 +1,10 @@
 """Render a volume sequence (smoke, fire) from cameras around its unit box; write images and points of every frame.
 
-volumes/KEY/scene.json                 what was rendered, and how scene units map to the files' world
+KEY is a hash of all inputs of the images.
+
+volumes/KEY/scene.json                 inputs of the images, and the map from the files' world to scene units
 volumes/KEY/frame_00012/cam_07.exr     linear RGB radiance and alpha, premultiplied, half floats
-volumes/KEY/frame_00012/points.npz     where the frame's matter is, for starting points; KEY is a hash of all inputs
+volumes/KEY/frame_00012/points.npz     points in the frame's matter, for starting points
 """
 
 from __future__ import annotations
@@ -37,7 +39,8 @@ from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Light, 
 from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation, GridReader
 
 RENDERER_VERSION = 3
-"""Part of the cache's key: raise it with every change to the march, the optics, the cameras or the files' layout."""
+"""Version of the renderer, a part of the cache's key. Raise the version with every change to the ray marching, the
+optics, the cameras or the files' layout."""
 
 POINTS = 8192
 """Starting points stored per frame."""
@@ -57,7 +60,8 @@ class Capture:
         frames: the .vdb files, in order.
         cameras: training cameras, then ``held_out`` test cameras.
         samples: rays per pixel along each axis of the image.
-        lights: number of lights per frame. If several, training cameras take turns; test cameras have other lights.
+        lights: number of lights per frame. If there are several, each training camera sees one of these lights; test
+            cameras see other lights.
         bounds: (2, 3) box around all matter, scene units.
         ends: numbers of the frames with time 0 and 1; None for the first and the last frame.
         measured: frame number -> extent of its extinction grid; empty if unknown.
@@ -77,7 +81,10 @@ class Capture:
 
     @property
     def components(self) -> tuple[str, ...]:
-        """Meanings of grids whose share of sigma models store: the extinction grid if flames add to it, else none."""
+        """Meanings of the grids whose share of the extinction a model stores.
+
+        This is the extinction grid if flames add to the extinction; otherwise, there is none.
+        """
         return (self.reader.extinction,) if self.optics.mixes(self.reader.names) else ()
 
     @property
@@ -103,9 +110,10 @@ class Capture:
         return hashlib.sha256(json.dumps(parts, default=_encode_capture_value).encode()).hexdigest()[:16]
 
     def frame_lights(self, frame: VdbFrame) -> list[Light | None]:
-        """Return each camera's light in a frame; with :attr:`lights` = 1, all have the light of the optics.
+        """Return the light of each camera in a frame; if :attr:`lights` is 1, it is the light of the optics.
 
-        Of several lights, the first is the light of the optics. The lights of test cameras are the same in all frames.
+        If there are several lights, the first is the light of the optics and the others are random. The lights of test
+        cameras are random, but the same in all frames.
         """
         if self.lights == 1:
             return [self.optics.light] * len(self.cameras)
@@ -151,9 +159,9 @@ class Capture:
     def fetch_points(self, store: Store, frame: VdbFrame) -> Path:
         """Return the local path of a frame's ``points.npz``.
 
-        The file has the ``means`` (M, 3), scene units, and ``colors`` (M, 3), linear radiance, of M points. It also has
-        three numbers: the total extinction ``weight``, the largest extinction ``largest``, and the largest radiance in
-        the frame's images, ``brightest``.
+        The file has the ``means`` (M, 3), scene units, and ``colors`` (M, 3), linear radiance, of M points. The file
+        also has three numbers: the total extinction ``weight``, the largest extinction ``largest``, and the largest
+        radiance in the frame's images, ``brightest``.
         """
         return store.fetch_file(f"{self.frame_folder(frame)}/{LAST_FILE}", _POINTS_BYTES)
 
@@ -229,11 +237,11 @@ def _encode_capture_value(value: Any) -> Any:
 class CapturedVdbFrames(DatasetImages):
     """Ground truth of a volume sequence: every frame from every camera, rendered when missing.
 
-    A frame's folder appears only when all of its files are written. An interrupted run therefore continues with the
-    missing frames. If two runs render the same frame, the files of the first one remain.
+    A frame's folder appears only when all files of the frame are written. An interrupted run therefore continues with
+    the missing frames. If two runs render the same frame, the files of the first run remain.
 
     Args:
-        store: the store of ground truth; the images are in its ``volumes/KEY``.
+        store: the store of ground truth; the images are in the store's folder ``volumes/KEY``.
     """
 
     def __init__(self, capture: Capture, store: Store) -> None:
@@ -322,7 +330,7 @@ def _describe_capture_write_errors(store: Store) -> Iterator[None]:
 
 _TEST_CAMERAS = (0.4, 0.75)
 """Positions of the two test cameras in the sequence of all cameras, which runs from the rim of the hemisphere (0) to
-its pole (1). Both have neighbours on all sides, and they are 90 degrees apart."""
+its pole (1). Both test cameras have neighbours on all sides, and they are 90 degrees apart."""
 
 _DISTANCE = 2.7  # of cameras from the origin, the centre of the box, scene units (box sides)
 _ELEVATIONS = (3.0, 80.0)  # degrees above the horizon of the lowest and the highest camera
@@ -358,7 +366,7 @@ def hemisphere_capture_cameras(
 def choose_rays_per_pixel(camera: Camera, voxel: float) -> int:
     """Return the rays per pixel along each axis: 1 if pixels at the box's centre are narrower than a voxel, else 2.
 
-    ``voxel`` is the edge of a voxel in scene units. For such narrow pixels, images with one ray have a PSNR of 67 to
-    72 dB against many rays (`smoke_fire` at 160×160), and take a third of the time of 2 x 2 rays.
+    ``voxel`` is the edge of a voxel in scene units. One ray is enough for such narrow pixels: images with one ray have
+    a PSNR of 67 to 72 dB against many rays (`smoke_fire` at 160×160), and take a third of the time of 2 x 2 rays.
     """
     return 1 if _DISTANCE / camera.fx < voxel else 2

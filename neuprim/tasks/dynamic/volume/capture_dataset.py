@@ -26,7 +26,7 @@ from neuprim.tasks.dynamic.volume.capture_voxels import FrameVoxels, RecentFrame
 from neuprim.tasks.dynamic.volume.optics import Light
 
 TRAINING_MEMORY, _TEST_MEMORY, _VOXEL_MEMORY = 6 / 11, 1 / 11, 4 / 11
-"""Shares of the memory for training images, test images (read in order) and voxels."""
+"""Shares of the setting ``memory`` for training images, for test images (read in order) and for voxels."""
 
 LIGHT_DISTANCE = 1e4
 """Distance from the scene's centre at which directional lights are placed, scene units."""
@@ -42,7 +42,7 @@ class VdbFrameViews(ViewSet):
     Args:
         folder: store of the images.
         cameras: numbers of the capture's cameras whose views are included.
-        exposure: radiance that is scaled to 1.
+        exposure: radiance that becomes 1 in the pixels; all radiance is divided by ``exposure``.
         every: use every n-th frame only; times remain relative to the whole sequence.
         memory: limit on the decoded images in memory, bytes.
     """
@@ -98,8 +98,8 @@ class VdbFrameViews(ViewSet):
 def light_conditions(capture: Capture, light: Light | None) -> dict[str, Tensor]:
     """Return the conditions "light" (position) and "light_intensity" (irradiance) of a view with a light at infinity.
 
-    The position is so far away that rays are practically parallel. If all views have the same light, the result is
-    empty.
+    The position is so far away that the rays of light are practically parallel. If the light is the same in all views,
+    the result is empty, because the light is then no input of the model.
     """
     if capture.lights == 1 or light is None:
         return {}
@@ -116,8 +116,8 @@ class VolumeRecording:
         folder: store of the rendered images.
         exposure: the brightest radiance that any camera sees.
         weights: total extinction of each frame.
-        every: n, if every n-th frame is used for training.
-        test: the held-out views: all frames of one camera, then of the next.
+        every: n; every n-th frame is used for training.
+        test: the held-out views: all frames of one camera, then all frames of the next.
     """
 
     name: str

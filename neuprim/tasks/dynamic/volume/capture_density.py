@@ -1,4 +1,4 @@
-"""Ground-truth extinction and radiance of a volume sequence's .vdb files, and the errors of models against them."""
+"""Ground-truth extinction and radiance from a volume sequence's .vdb files, and errors of models against them."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ def sample_extinction(
 
 
 class CaptureDensity(DensityGridSource):
-    """Ground-truth density of the .vdb files of ``path``, or of the scene if ``path`` is None.
+    """Ground-truth density from the .vdb files at ``path``, or from the scene's files if ``path`` is None.
 
-    Grids, optics, placement and times are those of the scene. If ``path`` is a folder, frames outside the scene's
-    times are left out. If ``path`` is a single file outside these times, its frame has no time. Models are compared
-    on the voxels of the frame, in a box that also contains the sequence's box.
+    Grid names, optics, placement and times are those of the scene. If ``path`` is a folder, frames outside the scene's
+    times are left out. If ``path`` is a single file outside these times, the file's frame has no time. Models are
+    compared with the file at the frame's voxels, in a box that also contains the sequence's box.
 
     Raises:
         DataError: there is no file, or no frame within the scene's times.
@@ -122,11 +122,11 @@ class CaptureDensity(DensityGridSource):
 def compare_capture_extinction(model: Primitives, capture: Capture, times: list[float]) -> dict[str, Any]:
     """Measure a model's errors of extinction (sigma) against the .vdb files of a sequence; return name -> value.
 
-    All voxels of the sequence's box are compared; of boxes of more than 2^27 voxels, an evenly spaced part. ``times``
-    has the time of every frame. "sigma_frames" has the errors of each compared frame, see
+    All voxels of the sequence's box are compared, or an evenly spaced part if there are more than 2^27 voxels.
+    ``times`` has the time of every frame. In the result, "sigma_frames" has the errors of each compared frame, see
     :func:`~neuprim.core.volumes.density_truth.measure_density_errors`. There are also means over the early, middle and
     late third of the sequence, each over three evenly spaced frames. Frames without extinction are left out. If flames
-    add to the extinction of a grid, the errors of that grid's part are also measured: "density_frames", ...
+    add to the extinction of a grid, the errors of the grid's own part are also measured: "density_frames", ...
     """
     result: dict[str, Any] = {}
     count, truth, compared = len(capture.frames), CaptureDensity(capture), 3 * _COMPARED_PER_THIRD

@@ -28,9 +28,9 @@ T = TypeVar("T")
 
 
 class RecentFrames(Generic[T]):
-    """Cache of items, which ``read`` (index) provides on first use; ``size`` returns an item's bytes.
+    """Cache of items. ``read`` (index) provides an item on first use; ``size`` (item) returns the item's bytes.
 
-    If the items exceed ``memory`` bytes, the least recently used ones are dropped.
+    If the items exceed ``memory`` bytes, the least recently used items are dropped.
     """
 
     def __init__(self, read: Callable[[int], T], size: Callable[[T], int], memory: float) -> None:
@@ -71,9 +71,10 @@ class MediumVoxels:
 
     Attributes:
         index: (V,) int64 ascending, flat indices (i Y + j) Z + k of a grid of ``shape``.
-        values: (V, C) float32: sigma, sigma times RGB radiance; if flames add to sigma, the part of sigma that comes
-            from the extinction grid; if the model lights the voxels, this part times the RGB albedo.
-        scene_from_index: (4, 4) float64.
+        values: (V, C) float32 columns: sigma (the extinction); sigma times RGB radiance; if flames add to sigma, the
+            part of sigma that comes from the extinction grid; if the model lights the voxels, this part times the RGB
+            albedo.
+        scene_from_index: (4, 4) float64 matrix from voxel indices to scene coordinates.
     """
 
     index: np.ndarray
@@ -83,7 +84,7 @@ class MediumVoxels:
 
     @staticmethod
     def of(medium: Medium, lit: bool = False) -> MediumVoxels:
-        """Return the voxels of a medium that have a non-zero value; if ``lit``, with their albedo."""
+        """Return the voxels of a medium that have a non-zero value; ``lit`` adds the columns with the albedo."""
         bricks = medium.bricks
         columns = [medium.values]
         if medium.scattering is not None:
@@ -122,9 +123,9 @@ class MediumVoxels:
 
     @functools.cached_property
     def rms(self) -> tuple[float, float, float, float]:
-        """Root mean squares over the voxels of four values; 0 if there are no voxels or the value is not stored.
+        """Root mean squares, over the voxels, of four quantities; 0 if there are no voxels or no such column.
 
-        The values are sigma, sigma times radiance, the extinction grid's part of sigma, and this part times albedo.
+        These are sigma, sigma times radiance, the extinction grid's part of sigma, and this part times albedo.
         """
         squares = np.square(self.values, dtype=np.float64).mean(0) if len(self.index) else np.zeros(8)
         part = squares[4] if self.has_part else 0.0
@@ -171,12 +172,12 @@ class MediumVoxels:
 class FrameVoxels(PointSupervision):
     """Sampler of voxels, for training that compares the model with the extinction of the files.
 
-    The points of one draw are from one frame. The probability of a frame is proportional to its extinction; in one
-    draw of ten, it is the same for all frames. 70 % of the points are voxels with matter, 20 % lie up to six voxels
-    away from such a voxel, and 10 % anywhere in a box larger than the sequence's box.
+    The points of one draw are from one frame. In nine of ten draws, the probability of a frame is proportional to the
+    frame's extinction; in one of ten, all frames are equally probable. 70 % of the points are voxels with matter, 20 %
+    lie up to six voxels away from a voxel with matter, and 10 % anywhere in a box larger than the sequence's box.
 
     Args:
-        folder: store of the images. Lit voxels are stored there, too, since their light takes long to compute.
+        folder: store of the images. The voxels are stored there, too, since lighting the voxels takes long.
         frames: the frames, each with its time, 0..1.
         exposure: radiance that the training images show as 1.
         weights: total extinction of each frame.
@@ -238,10 +239,10 @@ class FrameVoxels(PointSupervision):
         )
 
     def _light_scales(self, emitted: float, scattered: float) -> tuple[float, float]:
-        """Return the scales of errors of sigma times radiance, and of that which smoke scatters per irradiance.
+        """Return two scales, by which the loss divides errors of emitted light, and of light scattered per irradiance.
 
-        If the model lights the voxels, both are relative to all light, emitted and scattered: a weak part of it must
-        not count as much as the other.
+        If the model lights the voxels, both scales are derived from the sum of emitted and scattered light, so that
+        errors of the weaker part do not count as much as errors of the stronger part.
 
         Args:
             emitted: root mean square of sigma times radiance.
@@ -258,10 +259,10 @@ class FrameVoxels(PointSupervision):
         return self.folder.retry(lambda: self._read_or_make_voxels(self.frames[t]), warn_once)
 
     def _supervised_medium(self, frame: VdbFrame) -> Medium:
-        """Return the medium whose voxels a model is compared with in training.
+        """Return the medium with whose voxels a model is compared in training.
 
-        Its radiance includes the scattered light of a single light. If the capture has several lights, their light is
-        not included, since the model adds it.
+        The medium's radiance includes scattered light if the capture has a single light. If there are several lights,
+        scattered light is not included, since the model computes it.
         """
         capture, medium = self.capture, self.capture.medium(frame)
         if capture.lights > 1:

@@ -35,8 +35,8 @@ _BLACK_BODY_STEPS = 1024  # entries of the table of black bodies; linear between
 def build_medium(grids: Mapping[str, VdbGrid], optics: Optics, scene_from_world: np.ndarray) -> Medium:
     """Build the medium of one frame on the voxels of its extinction grid, without the light ``optics.light``.
 
-    Other grids are sampled at the centres of these voxels, trilinearly unless they have the same transform. If flames
-    absorb, the voxels are extended to contain all flames. An empty frame gives an empty medium.
+    Other grids are sampled at the centres of these voxels: directly if the other grid has the same transform, else
+    trilinearly. If flames absorb, the voxels are extended to contain all flames. An empty frame gives an empty medium.
 
     Args:
         grids: meaning -> grid; grids that the optics do not use are ignored.
@@ -54,7 +54,7 @@ def build_medium(grids: Mapping[str, VdbGrid], optics: Optics, scene_from_world:
         )
     if base is None:
         wanted = " or ".join(repr(n) for n in optics.extinction_grids)
-        raise DataError(f"no grid {wanted} to take the extinction from{nearest(optics.extinction_grids[0], grids)}")
+        raise DataError(f"no grid {wanted}, needed for the extinction{nearest(optics.extinction_grids[0], grids)}")
     box = base.bounds
     if flames is not None and optics.flame_extinction > 0.0:
         box = _unite_medium_boxes(box, _transform_medium_bounds(flames, base.transform))
@@ -87,9 +87,10 @@ def build_medium(grids: Mapping[str, VdbGrid], optics: Optics, scene_from_world:
 
 
 def _transform_medium_bounds(grid: VdbGrid, transform: np.ndarray) -> Bounds | None:
-    """Return the bounds of the active box of ``grid`` in voxels of another grid, or None if it has no active voxels.
+    """Return the box of active voxels of ``grid`` in voxels of another grid; None if there are no active voxels.
 
-    ``transform`` is the index-to-world matrix of the other grid. Its voxels with centres in the box are inside.
+    ``transform`` is the index-to-world matrix of the other grid. The result contains the voxels of the other grid whose
+    centres are inside the active box.
     """
     if grid.bounds is None or _same_voxels(grid.transform, transform):
         return grid.bounds
@@ -121,11 +122,11 @@ def _same_voxels(a: np.ndarray, b: np.ndarray) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _MediumGrid:
-    """The voxels of a medium before it is padded: those of its extinction grid in a box, densely or in bricks.
+    """The voxels of a medium without padding: the extinction grid's voxels in a box, stored densely or in bricks.
 
     Attributes:
-        transform: (4, 4) from indices of the extinction grid to the world.
-        box: outside it, all values are 0.
+        transform: (4, 4) matrix from indices of the extinction grid to the world.
+        box: first voxel of the box, and one more than the last; outside the box, all values are 0.
         first: (3,) int64 index, in the extinction grid, of the first voxel of ``bricks``.
     """
 
@@ -136,7 +137,7 @@ class _MediumGrid:
 
     @staticmethod
     def of(absorbing: Sequence[VdbGrid], transform: np.ndarray, box: Bounds) -> _MediumGrid:
-        """Choose bricks if the box is large and the absorbing grids are almost empty.
+        """Return the voxels of a box: in bricks if the box is large and the absorbing grids almost empty, else densely.
 
         Raises:
             DataError: the bricks take more memory than :data:`DENSE_LIMIT`, or are too many.
@@ -173,7 +174,7 @@ class _MediumGrid:
         return result
 
     def sample(self, grid: VdbGrid, channels: int = 1) -> np.ndarray:
-        """Sample a grid at the voxels' centres, trilinearly unless they are its own voxels.
+        """Sample a grid at the voxels' centres, trilinearly unless the grid has the same voxels.
 
         The result is (B, x, y, z) float32, or (B, x, y, z, 3) for three channels. Values that are not finite and
         negative scalars become 0.
@@ -227,9 +228,10 @@ class _MediumGrid:
 
 
 def _transform_boxes(boxes: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return boxes (M, 2, 3) in voxels of another grid, each with one more voxel around; see :func:`grid_boxes`.
+    """Convert boxes (M, 2, 3) of :func:`grid_boxes` to voxels of another grid, with a margin of one voxel.
 
-    ``source`` and ``target`` are the index-to-world matrices of the two grids.
+    ``source`` and ``target`` are the index-to-world matrices of the two grids. Boxes do not change if both grids have
+    the same voxels.
     """
     if _same_voxels(source, target):
         return boxes
@@ -245,7 +247,7 @@ def _scattering_albedo(
 ) -> np.ndarray:
     """Return the albedo, times the colour grid or else the colour gradient; broadcastable to (B, x, y, z, 3).
 
-    ``scene_from_index`` is relative to the first of the voxels.
+    ``scene_from_index`` (4, 4) maps voxel indices to the scene; index 0 is the first of ``voxels``.
     """
     albedo = np.array(optics.albedo, np.float32)
     if optics.color_grid is not None and optics.color_grid in grids:
@@ -299,8 +301,8 @@ def draw_lights(optics: Optics, count: int, *key: int) -> list[Light | None]:
 def light_medium(medium: Medium, light: Light | None, optics: Optics, reuse: bool = False) -> Medium:
     """Return the medium with scattered light of ``light``, with shadows, added to its radiance.
 
-    The added radiance is the mean over all view directions: it does not depend on ``optics.anisotropy``. With
-    ``reuse``, the result overwrites the values of ``medium``, which saves memory.
+    The added radiance is the mean over all view directions, so ``optics.anisotropy`` has no effect. With ``reuse``, the
+    result overwrites the values of ``medium``, which saves memory.
     """
     if light is None or medium.empty or medium.scattered is None:
         return medium
@@ -309,9 +311,9 @@ def light_medium(medium: Medium, light: Light | None, optics: Optics, reuse: boo
 
 
 def _add_scattered(medium: Medium, scattered: np.ndarray, light: Light, values: np.ndarray) -> Medium:
-    """Add to ``values``, in place, the light that ``medium`` scatters, (B, x, y, z) per unit of irradiance.
+    """Add the light that ``medium`` scatters to ``values``, in place; return the medium with these values.
 
-    Return the medium with these values.
+    ``scattered`` (B, x, y, z) is the sum of the octaves, or one octave, of :mod:`neuprim.tasks.dynamic.scattering`.
     """
     assert medium.scattered is not None
     arriving = np.array(light.irradiance, np.float32) / np.float32(4.0 * math.pi)
@@ -326,8 +328,8 @@ class LitMedium:
 
     Attributes:
         medium: the medium with all radiance that does not depend on the view direction.
-        beams: one medium per octave of anisotropic scattering, whose radiance is the mean over all view directions,
-            with its anisotropy; none if scattering is isotropic.
+        beams: pairs (medium, anisotropy), one per octave of anisotropic scattering; empty if scattering is isotropic.
+            The radiance of such a medium is the octave's light, averaged over all view directions.
         direction: towards the light, on the scene's axes, of any length.
     """
 
@@ -358,8 +360,8 @@ class LitMedium:
     def render(self, camera: Camera, samples: int) -> Tensor:
         """Render to (H, W, 4), see :func:`~neuprim.tasks.dynamic.volume.raymarch.render_medium`.
 
-        The angle between view and light is that of the pixel's centre. It is the same along a ray, as the light is at
-        infinity.
+        The angle between view and light is constant along a ray, as the light is at infinity. The angle at the pixel's
+        centre is used.
         """
         image = render_medium(self.medium, camera, samples)
         if self.beams:
@@ -378,10 +380,10 @@ def light_by_fire(medium: Medium, glow: np.ndarray, optics: Optics) -> Medium:
     """Return the medium with the light of its flames, scattered by its smoke, added to its radiance.
 
     The glowing voxels are divided into at most ``optics.fire_lights`` clusters, each of which lights the smoke as one
-    point light at its centre: σ_s albedo S(T) I/(4π (r² + ρ²)). I is the sum of σ c over the cluster times the volume
-    of a voxel, T is the transmittance to the centre, S is :func:`~neuprim.tasks.dynamic.scattering.scattered_light`, r
-    is the distance to the centre, and ρ is the root mean square distance of the cluster's voxels from it, plus half the
-    edge of a voxel.
+    point light at its centre: σ_s albedo S(T) I/(4π (r² + ρ²)). σ_s is the smoke's part of the extinction. I is the sum
+    of ``glow`` over the cluster times the volume of a voxel. T is the transmittance to the centre, and S is
+    :func:`~neuprim.tasks.dynamic.scattering.scattered_light`. r is the distance to the centre. ρ is the root mean
+    square distance of the cluster's voxels from the centre, plus half the edge of a voxel.
 
     Args:
         medium: a medium with ``scattered``.

@@ -1,9 +1,9 @@
 """A voxel medium: extinction and source radiance, and the layout of its voxels in memory.
 
-A medium is one block with all voxels of its box or, if the box is large and almost empty, bricks where it is not empty.
-A cell is the cube between eight voxel centres. A brick has 8 x 8 x 8 cells, so 9 x 9 x 9 voxels: neighbouring bricks
-share their outer voxels, and every cell has its voxels in one brick. Memory follows the voxels that are not empty, as
-in .vdb files.
+A medium is stored as one block with all voxels of its box. If the box is large and almost empty, the medium is stored
+as bricks instead, and empty bricks take no memory, as in .vdb files. A cell is the cube between eight voxel centres. A
+brick has 8 x 8 x 8 cells, so 9 x 9 x 9 voxels: neighbouring bricks share their outer voxels, so that all voxels of a
+cell are in one brick.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Medium:
 
     Attributes:
         values: (B, x, y, z, 4) float32, C-contiguous: σ in 1/scene unit, and σ times the source radiance in linear RGB.
-            The outermost voxels of the box are zero, so that the field is continuous; :meth:`padded` adds that layer.
+            The outermost voxels of the box are zero, so that the field is continuous; :meth:`padded` adds such voxels.
         scene_from_index: (4, 4) float64, affine and invertible; maps (i, j, k, 1) to the centre of voxel (i, j, k).
         bricks: layout of the voxels.
         scattering: (B, x, y, z) float32, the extinction grid's part of σ; None if flames do not add to σ.
@@ -56,7 +56,7 @@ class Medium:
         return Medium.dense(np.zeros((0, 0, 0, 4), np.float32), np.eye(4))
 
     def padded(self) -> Medium:
-        """Return this medium, surrounded by one layer of empty voxels if it is dense; bricks have such a layer.
+        """Return this medium; a dense one is surrounded by a layer of empty voxels, which bricks already have.
 
         Raises:
             DataError: a value is not finite.
@@ -75,7 +75,7 @@ class Medium:
         """Return this medium; raise DataError if a value is not finite."""
         ends = self.values.min(initial=0.0), self.values.max(initial=0.0)  # NaN if a value is, and without a copy
         if not np.isfinite(ends).all():
-            raise DataError("medium: values are NaN or infinite; expected finite ones (scene.optics)")
+            raise DataError("medium: some voxels are NaN or infinite; expected finite values (check scene.optics)")
         return self
 
     @property
@@ -89,7 +89,7 @@ class Medium:
         return self.centers(places), places
 
     def centers(self, places: tuple[np.ndarray, ...]) -> np.ndarray:
-        """Return the (M, 3) float64 centres of voxels, scene units; ``places`` are as of :meth:`Bricks.select`."""
+        """Return the (M, 3) float64 centres of voxels, scene units; ``places`` come from :meth:`Bricks.select`."""
         return self.bricks.index(places) @ self.scene_from_index[:3, :3].T + self.scene_from_index[:3, 3]
 
     @cached_property
@@ -99,7 +99,7 @@ class Medium:
 
     @cached_property
     def skips(self) -> np.ndarray:
-        """(B, x-1, y-1, z-1) uint8 distance of each cell to the nearest non-empty one.
+        """(B, x-1, y-1, z-1) uint8 distance of each cell to the nearest non-empty cell.
 
         A ray in a cell with distance d crosses the cube around the cell, 2d - 1 cells wide, in one step. Distances are
         chessboard distances, at most 255 in a dense medium and at most 1 in bricks.
@@ -121,7 +121,7 @@ class Medium:
 
 
 def pad_voxels(values: np.ndarray, bricks: Bricks) -> np.ndarray:
-    """Return voxels (B, x, y, z, ...), with one layer of zeros around them if the layout is dense."""
+    """Return ``values`` (B, x, y, z, ...), surrounded by one layer of zeros if the layout is dense."""
     around = [(0, 0), (1, 1), (1, 1), (1, 1), *[(0, 0)] * (values.ndim - 4)]
     return np.pad(values, around) if bricks.dense else values
 
@@ -138,12 +138,12 @@ _POINTS_PER_JOB = 1 << 14
 
 @dataclass(frozen=True, eq=False)
 class Bricks:
-    """Places of B blocks of voxels in a box. Arrays of voxels have the shape (B, x, y, z, ...).
+    """Layout of a box of voxels, which is stored as B blocks. Arrays of voxels have the shape (B, x, y, z, ...).
 
     Attributes:
         shape: voxels of the box along each axis.
-        table: int32, one entry per brick of the box: its number, or -d for an empty brick. Every cell within a
-            chessboard distance below d of any cell of this brick is empty.
+        table: int32, one entry per brick of the box: the number of the brick's block, or -d for an empty brick. Every
+            cell within a chessboard distance below d of any cell of the empty brick is empty, too.
         dense: whether one block has all voxels of the box.
     """
 
@@ -190,18 +190,21 @@ class Bricks:
         return np.argwhere(self.table >= 0) * (0 if self.dense else EDGE)
 
     def select(self, chosen: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the places of voxels in arrays (B, x, y, z, ...), each voxel once although bricks share some.
+        """Return the places of voxels in arrays (B, x, y, z, ...), each voxel only once although bricks share voxels.
 
         ``chosen`` is a bool array (B, x, y, z), False for the outermost voxels of the box.
         """
         return np.nonzero(self.without_shared(chosen))
 
     def without_shared(self, values: np.ndarray) -> np.ndarray:
-        """Return a view of voxels (B, x, y, z, ...) without those that also belong to the next brick."""
+        """Return a view of ``values`` (B, x, y, z, ...) without the voxels that also belong to the next brick."""
         return values if self.dense else values[:, :EDGE, :EDGE, :EDGE]
 
     def copy_shared(self, values: np.ndarray) -> None:
-        """Copy to the last voxels of each brick, in place, what the next bricks have there; zeros if there are none."""
+        """Fill the last voxels of each brick, in place, from the next bricks, which share these voxels.
+
+        Where the next brick is empty, the voxels become 0.
+        """
         if self.dense:
             return
         table, places = np.pad(self.table, (0, 1), constant_values=-1), self.origins // EDGE
@@ -228,9 +231,10 @@ class Bricks:
 
 
 def bricks_with_voxels(boxes: list[np.ndarray], shape: np.ndarray) -> np.ndarray:
-    """Return the bricks, a bool array, whose cells touch a voxel of boxes in a volume of ``shape`` voxels.
+    """Return a bool array with an entry per brick of a volume: whether the brick's cells touch a voxel in ``boxes``.
 
-    Each array of ``boxes`` is (M, 2, 3): first voxel, and one more than the last.
+    ``shape`` is the number of voxels of the volume along each axis. Each array in ``boxes`` is (M, 2, 3): the first
+    voxel of each box, and one more than the last voxel.
 
     Raises:
         DataError: the volume has too many bricks, even if all are empty.
@@ -249,7 +253,7 @@ def bricks_with_voxels(boxes: list[np.ndarray], shape: np.ndarray) -> np.ndarray
 
 
 def grid_boxes(grid: VdbGrid) -> np.ndarray:
-    """Return (M, 2, 3) int64 boxes, in voxel indices, around the values other than 0 of a grid's leaves and tiles."""
+    """Return (M, 2, 3) int64 boxes, in voxel indices: one around the non-zero values of each leaf or tile of a grid."""
     filled = np.asarray(grid.values != 0)
     filled = filled if grid.channels == 1 else np.asarray(filled.any(-1))
     used = np.asarray(filled.any((1, 2, 3)))
@@ -296,7 +300,7 @@ def find_brick(table, shift, i, j, k):  # type: ignore[no-untyped-def]
 
 @inline
 def trilinear_sample(v, i, j, k, x, y, z):  # type: ignore[no-untyped-def]
-    """Return the trilinear value of a block ``v`` (x, y, z) in its cell (i, j, k), at the fractions x, y, z of it."""
+    """Interpolate a block ``v`` trilinearly in its cell (i, j, k), at the fractions x, y, z (0..1) of the cell."""
     a = v[i, j, k] + z * (v[i, j, k + 1] - v[i, j, k])
     b = v[i, j + 1, k] + z * (v[i, j + 1, k + 1] - v[i, j + 1, k])
     c = v[i + 1, j, k] + z * (v[i + 1, j, k + 1] - v[i + 1, j, k])

@@ -72,7 +72,7 @@ class Light:
 class Optics:
     """Everything that turns grids into extinction σ and source radiance c.
 
-    With d the value of the extinction grid and f that of the flame grid, at every voxel
+    At every voxel, with the value d of the extinction grid and the value f of the flame grid:
 
         σ_s = extinction · d                               scatters and absorbs
         σ_f = flame_extinction · f                         soot that only glows
@@ -95,9 +95,9 @@ class Optics:
         ambient: radiance that arrives from all directions, without shadows, RGB.
         light: a light at infinity; null for none.
         octaves: 1 for single scattering; more also approximate light that is scattered several times.
-        anisotropy: where the smoke scatters most of the light: forward above 0, so that it is brightest against the
-            light, backward below 0; 0 for all directions equally. It is g of Henyey and Greenstein's phase function.
-        flame_grid: name of the grid f; a file without it does not glow.
+        anisotropy: g of Henyey and Greenstein's phase function. Above 0, smoke scatters most of the light forward and
+            is brightest against the light; below 0, backward; 0: equally in all directions.
+        flame_grid: name of the grid f; files without this grid do not glow.
         flame_range: values of f at the two ends of ``kelvin``.
         kelvin: temperatures of the coldest and the hottest flame.
         emission: radiance of the hottest flame; 0 for no glow.
@@ -131,7 +131,7 @@ class Optics:
 
     @property
     def octave_share(self) -> float:
-        """Strength of each further octave of scattered light, relative to the one before: half the mean albedo.
+        """Strength of each further octave of scattered light, relative to the previous octave: half the mean albedo.
 
         An octave approximates one more order of multiple scattering. benchmarks/multiple_scattering.py compares images
         with path tracing, for an albedo of 0.9.
@@ -213,7 +213,10 @@ OPTICS_PRESETS = {
 
 
 def optics_preset(name: str, up: Axis = "z") -> Optics:
-    """Return the optics of the preset ``scene.look=name`` for the up axis ``up``; ConfigError if it does not exist."""
+    """Return the optics of the preset ``name`` (``scene.look``) for the upward axis ``up``.
+
+    Raises ConfigError if the preset does not exist.
+    """
     if name not in OPTICS_PRESETS:
         raise ConfigError(f"scene.look={name}: no such look{nearest(name, OPTICS_PRESETS)}")
     return OPTICS_PRESETS[name].turn_to_axis(up)

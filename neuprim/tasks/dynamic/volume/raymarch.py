@@ -1,10 +1,10 @@
 """Ray marching of a voxel medium, cell by cell: images, and the transmittance to a light.
 
 A cell is the cube between eight voxel centres. Along a straight line through a cell, a trilinear field is a cubic
-polynomial. Two Gauss points integrate it exactly, so a ray's optical depth has no discretisation error. For the
-radiance, the source at each point is weighted by the transmittance up to the point. The weights are scaled so that a
-constant source is integrated exactly. The error is of fourth order in the step. Steps with an optical depth above 0.5
-are shortened.
+polynomial. Gauss quadrature with two points integrates a cubic polynomial exactly, so a ray's optical depth has no
+discretisation error. For the radiance, the source at each Gauss point is weighted by the transmittance up to the point.
+The weights are scaled so that a constant source is integrated exactly. The error is of fourth order in the step. Steps
+with an optical depth above 0.5 are shortened.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ _C2, _C3, _C4, _C5, _C6, _C7 = (np.float32(1.0 / n) for n in range(2, 8))
 def render_medium(medium: Medium, camera: Camera, samples: int = 2, subdivisions: int = 1) -> Tensor:
     """Render a medium to (H, W, 4) float32 linear premultiplied RGBA, without a background.
 
-    Alpha is exact up to rounding; radiance has an error of fourth order. A ray ends where T < 1e-4.
+    Alpha is exact up to rounding; radiance has an error of fourth order in the step. A ray ends where its transmittance
+    falls below 1e-4.
 
     Args:
         camera: pinhole, scene units.
@@ -60,8 +61,9 @@ def render_medium(medium: Medium, camera: Camera, samples: int = 2, subdivisions
 def light_transmittance(medium: Medium, direction: Sequence[float]) -> np.ndarray:
     """Return (B, x, y, z) float32 transmittance exp(-∫ σ ds) from voxel centres to a directional light.
 
-    ``direction`` points to the light, on the scene's axes, any length > 0. The transmittance is exact up to rounding.
-    Voxels without extinction get 1; no ray is traced from them.
+    ``direction`` points to the light, on the scene's axes, with any length > 0. The transmittance is exact up to
+    rounding, except that a ray stops at an optical depth of 16. Voxels without extinction get 1, because no ray is
+    traced from these voxels.
     """
     towards = np.array(direction, np.float64)
     return _transmittance_to(medium, np.append(towards / float(np.linalg.norm(towards)), 0.0))
@@ -70,7 +72,8 @@ def light_transmittance(medium: Medium, direction: Sequence[float]) -> np.ndarra
 def point_transmittance(medium: Medium, position: Sequence[float]) -> np.ndarray:
     """Return (B, x, y, z) float32 transmittance from voxel centres to a point, given in scene units.
 
-    The transmittance is exact up to rounding. Voxels without extinction get 1; no ray is traced from them.
+    The transmittance is exact up to rounding, except that a ray stops at an optical depth of 16. Voxels without
+    extinction get 1, because no ray is traced from these voxels.
     """
     return _transmittance_to(medium, np.append(np.array(position, np.float64), 1.0))
 
@@ -99,7 +102,8 @@ def _transmittance_to(medium: Medium, place: np.ndarray) -> np.ndarray:
 def _clip_march_to_slab(o, d, size, near, far):  # type: ignore[no-untyped-def]
     """Return the part of the interval [near, far] of t in which a ray's coordinate ``o + t d`` is within 0..size.
 
-    The function treats one axis. The result is empty (near > far) if the ray misses this range.
+    ``o`` and ``d`` are the ray's origin and direction along one axis. The result is empty (near > far) if the ray
+    misses the range 0..size.
     """
     if abs(d) < 1e-12:
         return (near, far) if 0.0 <= o <= size else (_FAR, -_FAR)
@@ -123,7 +127,7 @@ def _inverse_march_direction(d):  # type: ignore[no-untyped-def]
 def _march_cell_exit(o, inverse, cell, reach):  # type: ignore[no-untyped-def]
     """Return the t at which a ray leaves the cells ``cell - reach … cell + reach`` of one axis; 1e30 for never.
 
-    The ray's coordinate on this axis is ``o`` + t/``inverse``; ``inverse`` is 0 if it does not change.
+    The ray's coordinate on this axis is ``o`` + t/``inverse``; ``inverse`` is 0 if the coordinate does not change.
     """
     if inverse > 0.0:
         return (cell + reach + 1 - o) * inverse
@@ -136,7 +140,7 @@ def _march_cell_exit(o, inverse, cell, reach):  # type: ignore[no-untyped-def]
 def _next_march_cell(o, d, cell, reach, t, crossed):  # type: ignore[no-untyped-def]
     """Return the cell index along one axis after a ray has left the cells ``cell - reach … cell + reach`` at ``t``.
 
-    If the ray ``crossed`` their border on this axis, the index is exact, so that rounding cannot stop the ray.
+    If the ray ``crossed`` the cells' border on this axis, the index is exact, so that rounding cannot stop the ray.
     """
     if crossed:
         return cell + reach + 1 if d > 0.0 else cell - reach - 1
@@ -200,8 +204,8 @@ _FREE = ("nsz", "contract", "reassoc")  # fast-math flags of LLVM in _two_points
 def _generate_two_march_points(context: Any, flat: Any, corner: Any, first: Any, second: Any) -> Any:
     """Generate LLVM vector code that interpolates the four channels of voxels trilinearly at two points of a cell.
 
-    Return the numba signature and the generator. The code returns the channels at the first, then at the second point.
-    Scalar code takes 1.4 times as long.
+    Return the numba signature and the generator. The generated code returns the channels at the first point, then at
+    the second. Vector code is used because scalar code takes 1.4 times as long.
 
     Args:
         flat: float32 array of the interleaved voxels.
@@ -259,7 +263,7 @@ def _march_image_rows(  # type: ignore[no-untyped-def]
 
     Args:
         values, skips: attributes of the :class:`~neuprim.tasks.dynamic.volume.medium.Medium` to render.
-        table, shift, cells: attributes of its ``bricks``.
+        table, shift, cells: attributes of the medium's ``bricks``.
         pose: (3, 4) float64, from camera space (scene units) to indices.
         lens: (4,) float64 fx fy cx cy.
         samples: rays per pixel along each axis of the image.
@@ -351,17 +355,18 @@ def _march_image_rows(  # type: ignore[no-untyped-def]
 
 @kernel
 def _march_depths(start, stop, sigma, skips, table, shift, cells, origins, target, units, result):  # type: ignore[no-untyped-def]
-    """Write the optical depth from each voxel of slices start:stop to a point, or along a direction to the border.
+    """Write the optical depth from each voxel of slices start:stop to a point, or to the box's border in a direction.
 
-    Slices are numbered through all blocks.
+    A slice has all voxels of a block with the same index along x. Slices are numbered through all blocks. A ray stops
+    at an optical depth of 16.
 
     Args:
         sigma: (B, x, y, z) float32 extinction of a medium.
-        skips: its :attr:`~neuprim.tasks.dynamic.volume.medium.Medium.skips`.
-        table, shift, cells, origins: attributes of its ``bricks``.
+        skips: the medium's :attr:`~neuprim.tasks.dynamic.volume.medium.Medium.skips`.
+        table, shift, cells, origins: attributes of the medium's ``bricks``.
         target: (4,) float64, homogeneous: a position in indices and 1, or a direction in indices per scene unit and 0.
         units: (3, 3) float64, scene units per index.
-        result: (B, x, y, z) float32, without shared voxels; written where sigma > 0. A ray stops at a depth of 16.
+        result: (B, x, y, z) float32, without shared voxels; written where sigma > 0.
     """
     nx, ny, nz = cells[0], cells[1], cells[2]
     mask = (1 << shift) - 1

@@ -34,7 +34,7 @@ class GridReader:
     Attributes:
         names: meaning of a grid -> its name in the files.
         extinction: meaning of the grid that absorbs.
-        level_sets: names of the level sets to convert to fog; others are refused.
+        level_sets: names of the level sets to convert to fog volumes; other level sets are refused.
     """
 
     names: Mapping[str, str]
@@ -59,7 +59,7 @@ class GridReader:
     def read(self, path: Path) -> dict[str, VdbGrid]:
         """Read one file: return meaning -> grid. Missing grids are left out, since exporters drop empty grids.
 
-        Without a colour grid NAME, the grids NAME_r, NAME_g and NAME_b are its channels.
+        If the colour grid NAME is missing, the grids NAME_r, NAME_g and NAME_b become the channels of one grid.
         """
         in_file = {grid.name for grid in read_header(path).grids}
         found = {}
@@ -94,7 +94,7 @@ def _merge_color_channels(name: str, grids: Sequence[VdbGrid]) -> VdbGrid:
 
 
 def find_volume_grids(frames: Sequence[VdbFrame], chosen: Mapping[str, str]) -> GridReader:
-    """Find the grids that any frame has, first by the names that the user chose, then by common names.
+    """Find the grids by meaning in all frames, first by the names that the user chose, then by common names.
 
     Raises:
         DataError: a chosen grid is in no file or cannot be read (such as points), or no grid absorbs.
@@ -143,7 +143,7 @@ class SequenceSurvey:
         box: (2, 3) bounds of all matter, world units.
         extents: frame number -> extent of its extinction grid.
         hottest: largest value of the flame grids.
-        peaks: meaning -> a value that one voxel in a thousand exceeds.
+        peaks: meaning of a grid -> the value that one voxel in a thousand exceeds.
         voxel: shortest edge of a voxel of the extinction and flame grids, world units.
     """
 
@@ -190,13 +190,13 @@ def survey_volume_frames(
 
 
 def _count_vdb_values(values: np.ndarray) -> np.ndarray:
-    """Return a histogram (2^15,) of positive values. Bins ascend: a value's bin is the upper 16 bits of its float32."""
+    """Return a histogram (2^15,) of the positive values. The bin of a value is the upper 16 bits of its float32."""
     positive = values[np.isfinite(values) & (values > 0)]
     return np.bincount(positive.astype(np.float32).view(np.uint32) >> 16, minlength=1 << 15)
 
 
 def _peak_vdb_value(counts: np.ndarray) -> float:
-    """Return the 99.9 % quantile of a histogram of :func:`_count_vdb_values`, to about 1 %; 0 if it is empty."""
+    """Return the 99.9 % quantile of a histogram of :func:`_count_vdb_values`, to about 1 %; 0 without values."""
     cumulative = np.cumsum(counts)
     place = int(np.searchsorted(cumulative, _PEAK_QUANTILE * cumulative[-1]))
     return float(np.uint32(place << 16 | 1 << 15).view(np.float32)) if cumulative[-1] else 0.0
@@ -205,8 +205,8 @@ def _peak_vdb_value(counts: np.ndarray) -> float:
 def data_dependent_optics(optics: Optics, extinction: str, survey: SequenceSurvey) -> dict[str, Any]:
     """Return the settings of ``optics`` that depend on the values in the files, adapted to these values.
 
-    Presets assume grids with a peak of about 1, so the extinctions are divided by the peak. The divisor is rounded to a
-    power of two, so that it rarely changes when frames are added or left out.
+    Presets assume grids with a peak of about 1. The extinctions are therefore divided by the peak of the files' grids.
+    The divisor is rounded to a power of two, so that the divisor rarely changes when frames are added or left out.
     """
     grids = {"extinction": extinction, "flame_extinction": "flames"}
     settings: dict[str, Any] = {

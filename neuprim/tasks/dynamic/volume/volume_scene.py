@@ -82,23 +82,28 @@ class VdbSceneSettings:
 
     Attributes:
         vdb: folder of .vdb files, or None to simulate.
-        simulation: name of a built-in simulation. ``resolution``: voxels across its box. ``timesteps``: None for all.
+        simulation: name of a built-in simulation.
+        resolution: voxels across the box of the simulation.
+        timesteps: number of simulated time steps; None for all.
         frames: "all", "FIRST:LAST" or "FIRST:LAST:STEP" by number, LAST included.
         span: "FIRST:LAST" by number, the frames for training and evaluation; None for all. Times, box, exposure and
-            images stay those of all ``frames``.
+            images are still those of all ``frames``.
         chunks: number of time chunks, each trained in its own run; None or 1 for one run. For "auto" see
             :func:`count_time_chunks`.
         grids: meaning ("density", "flames", ...) -> name of the grid in the files.
-        look: name of a preset of the optics, or "auto"; ``optics``: changes to the preset's settings.
+        look: name of a preset of the optics, or "auto".
+        optics: changes to the preset's settings.
         size: width and height of the images in pixels.
         samples: n for n x n rays per pixel; None for 1 if pixels are narrower than voxels, else 2.
-        cameras: number of cameras on the upper hemisphere; two are held out. ``field_of_view``: degrees.
-        lights: number of directional lights per frame: the light of the look, then random ones. The cameras take turns.
-            With several lights, the light is a condition of the model; a single light is part of the colours.
+        cameras: number of cameras on the upper hemisphere; two cameras are held out.
+        field_of_view: full angle, degrees.
+        lights: number of directional lights per frame: the light of the look, then random lights. Each training camera
+            sees a frame under one of these lights. With several lights, the light is a condition (an input) of the
+            model; a single light is part of the colours.
         train_every: n: train on every n-th frame only. The test views have all frames.
         up: "y" or "z", the upward axis of the files.
         cache: folder or URL where the ground truth is stored; None for the user's cache on this machine.
-        memory: limit on the decoded images and voxels in memory, MiB; others are read again when needed.
+        memory: limit on the decoded images and voxels in memory, MiB; beyond it, data are read again when needed.
     """
 
     vdb: Annotated[Path, nonempty_text("a folder of .vdb files, or one of them")] | None = None
@@ -160,7 +165,7 @@ def choose_volume_frames(frames: str, numbers: Sequence[int], where: str = "the 
         return list(numbers)
     chosen = [n for n in numbers if n in wanted]
     if numbers and not chosen:
-        raise DataError(f"scene.frames={frames}: {where} has frames {numbers[0]} to {numbers[-1]}, but not these")
+        raise DataError(f"scene.frames={frames}: no such frame; {where} has frames {numbers[0]} to {numbers[-1]}")
     return chosen
 
 
@@ -186,7 +191,8 @@ class _PreparedVdbScene:
         if not numbers:
             begin, end = self.capture.clock
             raise DataError(
-                f"scene.span={self.settings.span}: the chosen frames are {begin} to {end}, but none is in the span"
+                f"scene.span={self.settings.span}: no frame is in the span; "
+                f"expected a part of the chosen frames, {begin} to {end}"
             )
         return numbers[0], numbers[-1]
 
@@ -218,7 +224,8 @@ def open_captured_vdb_frames(
     """Prepare the images of a volume scene without rendering them; raises as :func:`load_volume_scene`.
 
     Args:
-        known: facts about this scene from another process, so that the files need not be measured again.
+        known: facts about this scene from another process (:attr:`CapturedVdbFrames.known`), so that the files need not
+            be measured again.
     """
     return _prepare_vdb_scene(settings, context, known).rendered_frames(context)
 
@@ -280,7 +287,7 @@ def _prepare_vdb_scene(
 
 
 def _report_chosen_extinctions(scene: _PreparedVdbScene) -> None:
-    """Print one line with the extinctions that differ from the preset, because they were adapted to the files."""
+    """Print one line with the extinctions that differ from the preset because these were adapted to the files."""
     capture = scene.capture
     preset = scene.settings.resolve_optics("density" in capture.reader.names)
     lines = []
@@ -299,11 +306,12 @@ MAX_FRAMES, MIN_FRAMES = 100, 25
 """Maximum and minimum frames per chunk for "auto". Short chunks cut off primitives that are active for a long time."""
 
 _TIME_POWERS = {"window_center": 1, "velocity": -1, "acceleration": -2, "W_t": -1}
-"""Parameters whose unit contains time -> the exponent of time in it, e.g. -1 for a velocity."""
+"""Parameter whose unit contains time -> the exponent of time in the unit, e.g. -1 for a velocity."""
 
 _FRAMES_PER_OVERLAP, _MAX_OVERLAP = 8, 3
-"""A chunk contains extra frames beyond each end: one per eight of its frames, from one to three. Without overlap, the
-change from one chunk's model to the next is visible where little moves. But an overlap's frames are trained twice."""
+"""A chunk contains extra frames beyond each end: one per eight of the chunk's frames, from one to three. Without an
+overlap, the change from one chunk's model to the next is visible where little moves. A long overlap costs time,
+because its frames are trained twice."""
 
 
 def split_into_time_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | None:
@@ -312,7 +320,7 @@ def split_into_time_chunks(config: Mapping[str, Any], context: SceneContext) -> 
     All frames are rendered first, since the chunks share one exposure.
 
     Raises:
-        ConfigError: there are too few frames for so many chunks. Other errors as in :func:`load_volume_scene`.
+        ConfigError: there are too few frames for so many chunks. Other errors are as in :func:`load_volume_scene`.
     """
     scene = _prepare_vdb_scene({name: value for name, value in config["scene"].items() if name != "name"}, context)
     options, capture = scene.settings, scene.capture
@@ -365,7 +373,7 @@ def count_time_chunks(requested: int | str | None, frames: int, image_bytes: int
     count = int(requested or 1)
     if count > 1 and 2 * count > frames:
         reason = "a chunk needs at least two training frames"
-        expected = f"at most {frames // 2}, because {reason}" if frames >= 4 else f"null: {reason}"
+        expected = f"at most {frames // 2}, because {reason}" if frames >= 4 else f"null, because {reason}"
         available = "is 1 frame" if frames == 1 else f"are {frames} frames"
         raise ConfigError(f"scene.chunks={count}: there {available} for training; expected {expected}")
     return count
@@ -374,7 +382,8 @@ def count_time_chunks(requested: int | str | None, frames: int, image_bytes: int
 def _rescale_time(capture: Capture, frames: Sequence[VdbFrame], config: Mapping[str, Any]) -> dict[str, Any]:
     """Return setting -> value to change for a chunk, the part ``frames`` of a sequence that is trained separately.
 
-    Learning rates of time-dependent parameters are adapted to the chunk's length; the initial window is limited to it.
+    Learning rates of time-dependent parameters are adapted to the chunk's length in time. The initial window is limited
+    to this length.
     """
     length = capture.time(frames[-1]) - capture.time(frames[0])
     density = TimeDensity(config["model"]["neurons"], **config["model"]["density"])
@@ -403,7 +412,7 @@ def join_time_chunks(models: Sequence[Primitives], numbers: Sequence[int], overl
     for model in models:
         if not isinstance(model.density, TimeDensity) or model.density.seams:
             raise ConfigError(
-                f"cannot join chunks: the density of one is {type(model.density).__name__} "
+                f"cannot join chunks: a chunk's model has the density {type(model.density).__name__} "
                 f"{model.density.settings()}; expected a TimeDensity without seams (overlaps of joined chunks)"
             )
         if any(getattr(model, kind).settings() != getattr(first, kind).settings() for kind in ("density", "colour")):

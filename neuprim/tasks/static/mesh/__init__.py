@@ -53,9 +53,9 @@ class MeshSettings(SolidsSettings):
 
 
 def load_mesh(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load ``scene=mesh``, whose images are rendered on first use and stored in the cache.
+    """Load ``scene=mesh``. The first use renders the images and stores them in the cache.
 
-    Raises DataError if the mesh is damaged or needs files of other folders.
+    Raises DataError if the mesh is damaged or refers to a required file outside its folder.
     """
     asked = validate_settings(MeshSettings, settings, "scene")
     folder = generate_mesh_images(asked, context.cache_dir, context.progress)

@@ -41,9 +41,10 @@ _ROWS = 50_000  # vertices that are skinned at once, which bounds the memory
 
 
 class _GltfPrimitive(NamedTuple):
-    """Triangles of a glTF primitive, a part of a mesh with one material: ``faces`` (F, 3), other arrays per vertex.
+    """Triangles of a glTF primitive, which is a part of a mesh with one material.
 
-    Positions and normals are in mesh coordinates; those of skinned meshes are in scene coordinates.
+    ``faces`` (F, 3) has vertex indices; the other arrays have one row per vertex. Positions and normals are in mesh
+    coordinates, except in skinned meshes, where positions and normals are in scene coordinates.
     """
 
     material: str
@@ -56,7 +57,10 @@ class _GltfPrimitive(NamedTuple):
 
 
 def read_gltf(folder: MeshFolder) -> Model:
-    """Read the .gltf or .glb file of ``folder``; DataError if it is damaged, compressed or has an invalid reference."""
+    """Read the .gltf or .glb file of ``folder``.
+
+    Raises DataError if the file is damaged, compressed or has an invalid reference.
+    """
 
     def read() -> Model:
         reader = _GltfReader(GltfDocument(folder))
@@ -154,7 +158,7 @@ class _GltfReader:
             index = self.document.array(primitive["indices"], ["SCALAR"])[:, 0]
         check_mesh_limits(self.path, {"vertices": (count, MAX_VERTICES), "faces": (len(index) // 3, MAX_FACES)})
         if index.dtype.kind == "f" or (len(index) and index.max() >= count):
-            raise ValueError(f"an index is {index.max()}, with only {count} vertices")
+            raise ValueError(f"a face uses vertex {index.max()}, but there are only {count} vertices")
         name = str(to_gltf_index(primitive["material"])) if "material" in primitive else "none"
         material = materials[name]
         normals, colour, uv, glow_uv = None, None, None, None
@@ -194,8 +198,8 @@ class _GltfReader:
     ) -> NDArray[np.float64]:
         """Apply morph targets, then skinning, to ``values`` (V, 3): positions or normals, as ``name`` says.
 
-        ``name`` is "POSITION" or "NORMAL". ``weights`` are those of the morph targets. ``pose`` has the (J, 4, 4) joint
-        matrices; None for no skinning.
+        ``name`` is "POSITION" or "NORMAL". ``weights`` are the weights of the morph targets. ``pose`` has the (J, 4, 4)
+        joint matrices; None for no skinning.
         """
         count = len(values)
         for weight, target in zip(weights, primitive.get("targets", []), strict=False):
@@ -254,7 +258,7 @@ class _GltfReader:
         return found
 
     def _instance_matrices(self, node: Mapping[str, Any], matrix: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Return (4, 4) transforms of a node's mesh: one per instance (EXT_mesh_gpu_instancing), or the node's own."""
+        """Return (4, 4) scene-from-mesh matrices: one per instance (EXT_mesh_gpu_instancing), or the node's matrix."""
         instancing = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
         if instancing is None:
             return [matrix]
@@ -265,7 +269,7 @@ class _GltfReader:
         }
         lengths = {len(values) for values in columns.values()}
         if len(lengths) != 1:
-            raise ValueError(f"instance attributes have {sorted(lengths) or 'no'} values")
+            raise ValueError(f"attributes of instances have different or no lengths: {sorted(lengths) or 'no'} values")
         count = lengths.pop()
         check_mesh_limits(self.path, {"instances": (count, MAX_PARTS)})
         places = [{name: values[k] for name, values in columns.items()} for k in range(count)]
@@ -334,9 +338,10 @@ class _GltfReader:
 
 
 def _gltf_base_colour(material: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the base colour and texture of a JSON material under the keys of ``pbrMetallicRoughness``.
+    """Return the ``pbrMetallicRoughness`` values of a JSON material, among them the base colour and its texture.
 
-    If a material has the specular-glossiness extension, the extension's diffuse values are used instead.
+    If the material has the specular-glossiness extension, the result has only the extension's diffuse colour and
+    texture, renamed to ``baseColorFactor`` and ``baseColorTexture``.
     """
     glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
     if glossy is None:

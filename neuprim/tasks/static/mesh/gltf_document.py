@@ -38,7 +38,7 @@ _T = TypeVar("_T")
 
 
 def refuse_damaged_gltf(path: Path, function: Callable[[], _T]) -> _T:
-    """Return ``function()``, which reads a glTF document; convert the exceptions of damaged documents to DataError."""
+    """Return ``function()``, which reads a glTF document; convert exceptions that damage causes to DataError."""
     try:
         return function()
     except _DAMAGE as error:
@@ -47,7 +47,7 @@ def refuse_damaged_gltf(path: Path, function: Callable[[], _T]) -> _T:
 
 
 def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
-    """Return the JSON chunk and the binary chunk of a .glb file; the latter is None if the file has none."""
+    """Return the JSON chunk and the binary chunk of a .glb file, with None for a missing binary chunk."""
     magic, version, length, size, kind = struct.unpack_from("<5I", data)
     if magic != _GLB:
         raise ValueError(f"starts with {data[:4]!r}, not with b'glTF'")
@@ -56,7 +56,7 @@ def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
     if kind != _JSON:
         raise ValueError("no JSON chunk")
     if length > len(data) or 20 + size > len(data):
-        raise ValueError(f"the file has {len(data)} bytes, its header states {max(length, 20 + size)}")
+        raise ValueError(f"the file has {len(data)} bytes, but its header states {max(length, 20 + size)}")
     text, offset = data[20 : 20 + size], 20 + size
     while offset + 8 <= length:
         size, kind = struct.unpack_from("<2I", data, offset)
@@ -115,7 +115,7 @@ class GltfDocument:
         else:
             raise ValueError(f"buffers[{index}] has no uri")
         if len(data) < entry["byteLength"]:
-            raise ValueError(f"buffers[{index}] has {len(data)} bytes, its byteLength is {entry['byteLength']}")
+            raise ValueError(f"buffers[{index}] has {len(data)} bytes, but its byteLength is {entry['byteLength']}")
         return data
 
     def view(self, index: int) -> tuple[bytes, int]:
@@ -124,7 +124,7 @@ class GltfDocument:
         data = self._buffers[to_gltf_index(view["buffer"])]
         start, size = to_gltf_index(view.get("byteOffset", 0)), to_gltf_index(view["byteLength"])
         if start + size > len(data):
-            raise ValueError(f"bufferViews[{index}] ends at byte {start + size} of {len(data)}")
+            raise ValueError(f"bufferViews[{index}] ends at byte {start + size}, but its buffer has {len(data)} bytes")
         return data[start : start + size], to_gltf_index(view.get("byteStride", 0))
 
     def array(self, index: int, kinds: Sequence[str], length: int | None = None) -> NDArray:
@@ -138,7 +138,7 @@ class GltfDocument:
         if kind not in kinds:
             raise ValueError(f"{where} is {str(kind)[:20]}, not {' or '.join(kinds)}")
         if length is not None and count != length:
-            raise ValueError(f"{where} has {count} values, {length} vertices")
+            raise ValueError(f"{where} has {count} values for {length} vertices")
         if "sparse" in accessor or "bufferView" not in accessor:
             raise DataError(
                 f"{self.path}: {where} is sparse or compressed; "
@@ -153,7 +153,7 @@ class GltfDocument:
         if not count:
             return np.zeros((0, width), dtype)
         if start + (count - 1) * stride + row > len(data):
-            raise ValueError(f"{where} needs {start + (count - 1) * stride + row} bytes, its view has {len(data)}")
+            raise ValueError(f"{where} needs {start + (count - 1) * stride + row} bytes, but its view has {len(data)}")
         values: NDArray = np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize))
         if accessor.get("normalized") and dtype.kind in "iu":
             return np.maximum(values.astype(np.float32) / np.iinfo(dtype).max, -1.0)
@@ -170,7 +170,7 @@ def parse_gltf_uri(uri: Any) -> str:
 def to_gltf_index(value: Any) -> int:
     """Return a JSON value that is an index or a count; raise ValueError unless it is an integer of at least 0."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-        raise ValueError(f"an index is {str(value)[:20]}")
+        raise ValueError(f"an index or count is {str(value)[:20]}")
     return value
 
 

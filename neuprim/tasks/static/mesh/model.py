@@ -1,7 +1,7 @@
-"""Data classes of a mesh file, a reader of its bytes with size limits, and the triangulation of polygons.
+"""Data classes for the content of a mesh file, a size-limited file reader, and the triangulation of polygons.
 
 Files that a mesh file refers to, such as textures, are read only from the mesh file's folder. Polygons are triangulated
-by fans, or by ear clipping where a fan would change the surface. Self-intersecting polygons are refused.
+by triangle fans, or by ear clipping where fans would change the surface. Self-intersecting polygons are refused.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Material:
     )
     texture: str | None = None  # key of the image in Model.images
     wrap: tuple[str, str] = ("repeat", "repeat")  # outside 0..1 along u and v: "repeat", "clamp" or "mirror"
-    transform: tuple[tuple[float, ...], ...] | None = None  # (2, 3), for texture coordinates whose v points down
+    transform: tuple[tuple[float, ...], ...] | None = None  # (2, 3) matrix, for texture coordinates whose v points down
     opacity: float = 1.0  # factor on the alpha of texture and vertices
     cutoff: float | None = None  # alpha below which there is a hole; None where alpha is ignored
     blend: bool = False  # whether the file asks for translucency, which is not drawn
@@ -96,9 +96,10 @@ def find_model_file(path: Path) -> Path:
 
 
 class MeshFolder:
-    """Reader of a mesh file and of files below its folder: at most ``budget`` bytes in total. All bytes are hashed.
+    """Reader of a mesh file and of other files in or below its folder, with at most ``budget`` bytes in total.
 
-    With ``skip_missing``, a missing optional file, such as a texture, causes a warning instead of an error.
+    The property ``digest`` is a hash of all bytes read. With ``skip_missing``, a missing optional file, such as a
+    texture, causes a warning instead of an error.
     """
 
     def __init__(self, file: Path, skip_missing: bool = False, budget: int = MAX_BYTES) -> None:
@@ -195,7 +196,8 @@ def check_mesh_limits(path: Path, counts: Mapping[str, tuple[int, int]]) -> None
     """Raise DataError for the first count above its limit; ``counts`` maps a name to (count, limit)."""
     for name, (count, limit) in counts.items():
         if count > limit:
-            raise DataError(f"{path}: {count} {name}; expected at most {limit} (a part counts once for each use)")
+            expected = f"at most {limit} (a part counts once for each use)"
+            raise DataError(f"{path}: the mesh has {count} {name}; expected {expected}")
 
 
 def check_vertices(path: Path, positions: NDArray[np.float64], faces: NDArray[np.integer]) -> None:
@@ -222,10 +224,11 @@ _FLAT = 1e-10  # twice an area over the squared extent of the polygon, up to whi
 def triangulate_polygons(
     path: Path, corners: NDArray[np.float64], sizes: NDArray[np.integer]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Triangulate polygons; return (T, 3) indices into ``corners``, and (T,) the polygon of each triangle, ascending.
+    """Triangulate P polygons; return (T, 3) indices into ``corners``, and the (T,) polygon index of each triangle.
 
-    ``corners`` (C, 3) are the finite corners of all polygons, concatenated; ``sizes`` (P,) is the number of corners of
-    each polygon. Raises DataError for self-intersecting polygons.
+    Triangles are in the order of their polygons. ``corners`` (C, 3) are the finite corners of all polygons,
+    concatenated; ``sizes`` (P,) is the number of corners of each polygon. Raises DataError for self-intersecting
+    polygons.
     """
     first = np.cumsum(sizes) - sizes
     found, owners, crossed = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)], []
@@ -295,8 +298,9 @@ def _flatten_polygon(points: NDArray, normal: NDArray) -> NDArray[np.float64]:
 def _cut_ears(points: NDArray[np.float64], tests: int) -> tuple[NDArray[np.int64] | None, int]:
     """Triangulate a plane polygon (M, 2) by ear clipping (Meisters 1975).
 
-    Return (T, 3) corner indices, or None on failure, and what is left of ``tests``. Every test whether a corner can be
-    cut off reduces ``tests`` by one, or by more in large polygons. Below zero, the triangulation fails.
+    Return (T, 3) corner indices, or None on failure, and the remaining number of ``tests``. Every test whether a corner
+    can be cut off reduces ``tests`` by one, or by more in large polygons. If ``tests`` falls below zero, the
+    triangulation fails.
     """
     left, found = list(range(len(points))), []
     place, strict, failed = 0, True, 0

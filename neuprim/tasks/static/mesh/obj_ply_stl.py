@@ -123,8 +123,8 @@ def _look_up_obj_corners(table: NDArray[np.float64], index: NDArray[np.int64], m
 def _obj_number_table(key: str, numbers: NDArray[np.float64], lengths: NDArray[np.integer]) -> NDArray[np.float64]:
     """Return a table with the numbers of the N lines that start with ``key`` ("v", "vt" or "vn"), one row per line.
 
-    ``numbers`` are those of all N lines, concatenated; ``lengths`` (N,) is their count per line. Missing numbers are
-    NaN, or 0 for "vt".
+    ``numbers`` are the numbers of all N lines, concatenated; ``lengths`` (N,) is the count of numbers of each line.
+    Missing numbers become NaN, or 0 for "vt".
     """
     width = min(max(2, int(lengths.max(initial=2))), _WIDTHS[key][1])
     table = np.full((len(lengths), width), 0.0 if key == "vt" else np.nan)
@@ -184,7 +184,7 @@ def _read_mtl_library(text: str, folder: MeshFolder, images: dict[str, bytes]) -
 
 
 def _finish_mtl_material(material: Material) -> Material:
-    """Return the final form of a .mtl material: a colour that a texture replaces is white, black emission is None."""
+    """Return a .mtl material in its final form: colours become white where there is a texture; black emission, None."""
     white = (1.0, 1.0, 1.0)
     glow = material.glow
     if glow is not None and glow.texture is not None:
@@ -195,9 +195,9 @@ def _finish_mtl_material(material: Material) -> Material:
 
 
 def _read_mtl_texture(words: list[str], rest: str, folder: MeshFolder, images: dict[str, bytes]) -> Material | None:
-    """Read the texture of a .mtl line into ``images``; return a material with its name, wrap mode and transform.
+    """Read the texture of a .mtl line into ``images``; return a material with the texture's name, wrap and transform.
 
-    ``rest`` is the line without its key, ``words`` the same text split at blanks. The result is None if the file is
+    ``rest`` is the line without its keyword; ``words`` is ``rest`` split at blanks. The result is None if the file is
     missing and ``skip_missing`` is set.
     """
     image, options = _mtl_texture_file_name(words, rest)
@@ -215,9 +215,10 @@ def _read_mtl_texture(words: list[str], rest: str, folder: MeshFolder, images: d
 
 
 def _mtl_texture_file_name(words: list[str], rest: str) -> tuple[str, dict[str, tuple[float, float]]]:
-    """Split a .mtl texture line into the file name, which may contain blanks, and option -> its first two numbers.
+    """Return the file name in a .mtl texture line, and a mapping: option -> the option's first two numbers.
 
-    ``rest`` is the line without its key, ``words`` the same text split at blanks. Options precede the name.
+    ``rest`` is the line without its keyword; ``words`` is ``rest`` split at blanks. Options precede the file name. The
+    file name may contain blanks.
     """
     place, last = 0, len(words) - 1
     options: dict[str, tuple[float, float]] = {}
@@ -329,7 +330,7 @@ def _read_mesh_faces_of_ply(path: Path, data: bytes) -> tuple[list[Faces], int]:
 
 
 def _ply_mesh_colours(element: PlyElement, path: Path) -> NDArray[np.float32] | None:
-    """Return (N, 3) colours 0..1 of the vertices or faces of a .ply file; None if it has no colours."""
+    """Return (N, 3) colours 0..1 of ``element``, the vertices or faces of a .ply file; None if it has no colours."""
     if not set(_RGB) <= set(element.names):
         return None
     kind = element.rows.dtype["red"]
@@ -342,15 +343,15 @@ def _ply_mesh_colours(element: PlyElement, path: Path) -> NDArray[np.float32] | 
 def read_stl(folder: MeshFolder) -> Model:
     """Read an .stl file.
 
-    The file is read as binary if its length matches the face count at byte 80, even if it starts with "solid". Else it
-    is read as text.
+    If the file's length matches the face count at byte 80, the file is read as binary, even if it starts with "solid".
+    Otherwise, the file is read as text.
     """
     data = folder.read_model()
     count = int.from_bytes(data[80:84], "little")
     text = len(data) != 84 + 50 * count or len(data) < 84
     if text:
         if data[:5].lower() != b"solid" or b"facet" not in data[:_HEADER]:
-            expected = f"{84 + 50 * count} bytes, found {len(data)}"
+            expected = f"{84 + 50 * count} bytes for them, but the file has {len(data)}"
             raise DataError(f"{folder.file}: the header states {count} faces; expected {expected}")
         check_mesh_limits(folder.file, {"solids": (data.lower().count(b"endsolid"), MAX_PARTS)})
         count = data.lower().count(b"endfacet")

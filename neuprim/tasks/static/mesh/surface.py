@@ -41,13 +41,13 @@ class SurfacePart:
     """Triangles of one material, with final colours."""
 
     corners: NDArray[np.float64]  # (F, 3, 3) positions in the units and axes of the file, finite
-    normals: NDArray[np.float64] | None  # (F, 3, 3) of the file, if any
+    normals: NDArray[np.float64] | None  # (F, 3, 3) from the file; None if the file has no normals
     colour: NDArray[np.float32]  # (F, 3, 3) linear RGB
     uv: NDArray[np.float32] | None  # (F, 3, 2), v upward, if there is a texture
     material: Material  # provides the texture
-    bare: bool  # whether the file has no colour for it
+    bare: bool  # whether the file has no colour for these triangles
     alpha: NDArray[np.float32] | None = None  # (F, 3) 0..1; None for opaque
-    glow: SurfacePart | None = None  # emitted light: colour, uv and material of another part
+    glow: SurfacePart | None = None  # emitted light, as the colour, uv and material of a further part
 
 
 def read_surfaces(model: Model) -> list[SurfacePart]:
@@ -97,7 +97,7 @@ def _texture_coordinates(
 ) -> NDArray[np.float32] | None:
     """Return the (F, 3, 2) ``uv`` after the material's texture transform; None if texture or ``uv`` are missing.
 
-    ``faces`` is the number F. It is used in the warning about missing coordinates.
+    ``faces`` is the number F, which the warning about missing coordinates states.
     """
     if material.texture is None:
         return None
@@ -145,7 +145,7 @@ class MeshTexture:
     def look_up(self, uv: NDArray[np.float32], blur: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return (M, 4) linear RGBA at (M, 2) ``uv``, v upward.
 
-        ``blur`` (M,) is the width of each ray at the surface, in texels; it selects the mip level.
+        ``blur`` (M,) is the width of each ray at the surface, in texels. This width selects the mip level.
         """
         level = np.clip(np.round(np.log2(np.maximum(blur, 1.0))), 0, len(self.levels) - 1).astype(np.intp)
         found = np.empty((len(uv), 4), dtype=np.float32)
@@ -239,8 +239,8 @@ _Z_FROM_Y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 def scene_from_mesh_file(parts: Sequence[SurfacePart], upward: Up) -> NDArray[np.float64] | None:
     """Return the (4, 4) matrix from the axes of a mesh file to scene coordinates.
 
-    The mesh gets z up, is centred, and is scaled to fit into [-1, 1]^3 and into all images. The result is None if the
-    size of the mesh is 0 or out of range.
+    The matrix turns the mesh so that z is up, centres the mesh, and scales it to fit into [-1, 1]^3 and into all
+    images. The result is None if the size of the mesh is 0 or out of range.
     """
     turn = _Z_FROM_Y if upward == "y" else np.eye(3)
     lower = np.min([part.corners.min(axis=(0, 1)) for part in parts], axis=0)
@@ -259,7 +259,8 @@ def scene_from_mesh_file(parts: Sequence[SurfacePart], upward: Up) -> NDArray[np
 class MeshSurface(Scene):
     """Mesh for ray casting, in scene coordinates.
 
-    ``spacing`` is the distance between neighbouring rays at distance 1 from the camera; textures are filtered to it.
+    ``spacing`` is the distance between neighbouring rays at distance 1 from the camera. Textures are filtered to this
+    resolution.
     """
 
     def __init__(
@@ -355,10 +356,10 @@ class MeshSurface(Scene):
 
 
 class _MeshColourLayer:
-    """Colours at hits on faces whose ``kept`` (F,) is true: interpolated corner colours times textures.
+    """Surface colours at ray hits: interpolated corner colours times textures.
 
-    ``area`` (F,) is twice the area of each face, divided by the squared distance of neighbouring rays at distance 1
-    from the camera. ``pool`` shares decoded textures between layers.
+    ``kept`` (F,) selects the faces that can be hit. ``area`` (F,) is twice the area of each face, divided by the
+    squared distance of neighbouring rays at distance 1 from the camera. Layers share the decoded textures in ``pool``.
     """
 
     def __init__(
@@ -389,7 +390,8 @@ class _MeshColourLayer:
     def sample_colours(self, triangle: NDArray, weight: NDArray[np.float32], distance: NDArray) -> NDArray[np.float32]:
         """Return (M, 4) linear RGB and alpha of hits on triangles (M,) with barycentric weights (M, 3).
 
-        ``distance`` (M,) is that of each hit from the ray's origin; textures are blurred in proportion to it.
+        ``distance`` (M,) is the distance of each hit from the ray's origin. The blur of textures grows in proportion to
+        this distance.
         """
         found: NDArray[np.float32] = np.einsum("nk,nkc->nc", weight, self._colour[triangle])
         texture = self._texture[triangle]
@@ -409,7 +411,7 @@ def _transparent_faces(part: SurfacePart) -> NDArray[np.bool_]:
 
 
 def _warn_of_translucent_faces(model: Model, parts: Sequence[SurfacePart], pool: _Pool) -> None:
-    """Warn once about translucent faces: they are drawn opaque or left out."""
+    """Warn once if a mesh has translucent faces, because these are drawn opaque or left out."""
     soft = {key for key, texture in pool.items() if np.any((0 < texture.alpha) & (texture.alpha < 255))}
     count = 0
     for part in parts:
@@ -425,7 +427,8 @@ def _warn_of_translucent_faces(model: Model, parts: Sequence[SurfacePart], pool:
 def _separate_crowded_vertices(points: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trimesh:
     """Return a mesh in which vertices that more than 64 faces share are duplicated, one copy per corner.
 
-    The cost of smooth normals grows with the square of the faces at a vertex; faces at a copy get their own normals.
+    Duplication limits the cost of smooth normals, which grows with the square of the number of faces at a vertex. Faces
+    at a copy get their own normals.
     """
     around = np.bincount(faces.ravel(), minlength=len(points))
     crowded = around[faces] > _MOST_AROUND
@@ -440,8 +443,8 @@ def _smooth_normals(
 ) -> NDArray[np.float64]:
     """Return (F, 3, 3) unit corner normals: the file's normals, or :func:`solid_corner_normals` where it has none.
 
-    ``given`` (F, 3, 3) are the file's normals, 0 for missing ones; they are flipped to the side to which the face
-    normal points. ``across`` (F, 3) are the face normals, of any length.
+    ``given`` (F, 3, 3) are the file's normals, 0 where missing. The file's normals are flipped to the side to which the
+    face normal points. ``across`` (F, 3) are the face normals, of any length.
     """
     with np.errstate(all="ignore"):
         length = np.linalg.norm(given, axis=2, keepdims=True)

@@ -99,7 +99,7 @@ TREES: list[tuple[tuple[bytes, bytes], int, tuple[str, ...]]] = [
     (packed_leaf(struct.pack("<q", 9) + b"not a zip"), 3, ("damaged zip chunk",)),
     (packed_leaf(struct.pack("<q", -(2**62))), 3, (str(2**62), "expected 2048")),
     (packed_leaf(struct.pack("<q", 2**62)), 3, (str(2**62), "truncated")),
-    (packed_leaf(blosc_claim(2**31 - 1)), 6, ("Blosc chunk says 32 bytes hold 2147483647",)),
+    (packed_leaf(blosc_claim(2**31 - 1)), 6, ("Blosc chunk states that 32 bytes unpack to 2147483647",)),
     (packed_leaf(blosc_claim(2048)), 6, ("damaged Blosc chunk",)),
     (packed_leaf(struct.pack("<q", 4) + b"abcd"), 6, ("Blosc chunk of 4 bytes",)),
 ]

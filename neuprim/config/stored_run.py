@@ -59,9 +59,9 @@ def stored_choices(stored: RunConfig, typed: Choices, resumed: bool = False) -> 
             TASKS.find(str(typed[key]))  # a misspelt name is reported as such
         if resumed:
             raise _resumed_config_error(stored, key, typed[key], own[key])
-        has = "the level" if own[key] is None else f"{key} {own[key]}"
+        has = f"that {key}= sets" if own[key] is None else f"of {key} {own[key]}"
         raise ConfigError(
-            f"{key}={typed[key]}: the file of --config already includes the settings of {has}; leave {key}= out"
+            f"{key}={typed[key]}: the file of --config already includes the settings {has}; leave {key}= out"
         )
     return {key: typed[key] or own[key] for key in CHOICES}
 

@@ -31,7 +31,7 @@ FALLOFF_SPREAD = 0.4  # largest standard error of a measured falloff exponent
 
 @dataclass(frozen=True)
 class Lighting:
-    """Optional facts about a relighting dataset besides images, cameras and lights; stored in ``Dataset.extra``."""
+    """Light falloff, pixel classes, groups of test views, baselines and films; stored in ``Dataset.extra``."""
 
     # "inverse_square" if images darken with the square of the light's distance; a renderer then divides the intensity
     # by this square. "none" if the given intensities already include the falloff, or if the falloff is unknown

@@ -124,8 +124,9 @@ def test_the_preset_of_the_equations_is_the_papers_form_at_the_bytes_of_quick(fi
     assert equations.model.colour == {"powers": 4, "waves": 4, "frequencies": "printed"}
     assert equations.model.sh_degree == 3
     assert equations.train.voxels_every == quick.train.voxels_every == 4
-    train = dataclasses.replace(equations.train, voxels_every=quick.train.voxels_every)
-    assert (train, equations.renderer) == (quick.train, quick.renderer), "the budget and the rates are those of quick"
+    assert equations.train.rates.keys() == quick.train.rates.keys()
+    train = dataclasses.replace(equations.train, rates=quick.train.rates)
+    assert (train, equations.renderer) == (quick.train, quick.renderer), "the budget and the population are quick's"
     words = "preset=equations train.iterations=20 train.population.every=5 train.population.start=0 model.neurons=8"
     model = load_run(fit(files, tmp_path / "run", *words.split())).model
     assert model.parameters_per_primitive == 143 + 1

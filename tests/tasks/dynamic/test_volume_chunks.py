@@ -80,7 +80,11 @@ def test_the_number_follows_from_frames_and_memory(
 
 @pytest.mark.parametrize(
     ("requested", "frames", "message"),
-    [(5, 9, "there are 9 frames .* at most 4, because"), (2, 3, "expected null: a chunk"), (2, 1, "there is 1 frame")],
+    [
+        (5, 9, "there are 9 frames .* at most 4, because"),
+        (2, 3, "expected null, because a chunk"),
+        (2, 1, "there is 1 frame"),
+    ],
 )
 def test_more_than_the_frames_allow_is_refused(requested: int, frames: int, message: str) -> None:
     with pytest.raises(ConfigError, match=f"scene.chunks={requested}: .*{message}"):

@@ -28,15 +28,16 @@ class Medium:
     """Extinction and source of a medium at voxel centres, trilinear in between. A medium may have no voxels.
 
     The radiance along a ray is L = ∫ T(s) σ(s) c(s) ds with T(s) = exp(-∫₀ˢ σ), and alpha = 1 - T at the ray's end.
-    Voxels are stored in the B blocks of ``bricks``, most often in one block for the whole box.
+    Voxels are stored in the B blocks of ``bricks``, most often in one block for the whole box. σ = σ_s + σ_f: σ_s comes
+    from the extinction grid and σ_f from the flames, see :class:`~neuprim.tasks.dynamic.volume.optics.Optics`.
 
     Attributes:
         values: (B, x, y, z, 4) float32, C-contiguous: σ in 1/scene unit, and σ times the source radiance in linear RGB.
             The outermost voxels of the box are zero, so that the field is continuous; :meth:`padded` adds such voxels.
         scene_from_index: (4, 4) float64, affine and invertible; maps (i, j, k, 1) to the centre of voxel (i, j, k).
         bricks: layout of the voxels.
-        scattering: (B, x, y, z) float32, the extinction grid's part of σ; None if flames do not add to σ.
-        scattered: (B, x, y, z, 3) float32, the extinction grid's part of σ times the albedo; None without a light.
+        scattering: (B, x, y, z) float32, σ_s; None unless the extinction grid and the flames both absorb.
+        scattered: (B, x, y, z, 3) float32, σ_s times the albedo, while a light must still be added; else None.
     """
 
     values: np.ndarray

@@ -119,16 +119,19 @@ def decibel(name: str, runs: Sequence[Record], peaks: Mapping[tuple[str, int], f
 
 def table(record: Record) -> str:
     made = Table(
-        "scene", "seeds", "model", "bytes", *(f"under {name}" for name in LIT.values()), "frame time", "CPU seconds"
+        *("scene", "steps", "seeds", "model", "bytes"),
+        *(f"under {name}" for name in LIT.values()),
+        *("frame time", "CPU seconds"),
     )
     peaks = {(run["scene"], run["seed"]): run["exposure"] for run in record["trials"] if run["lights"] > 1}
-    for (scene, _, lights), runs in group_runs(record["trials"], "scene", "iterations", "lights").items():
+    for (scene, steps, lights), runs in group_runs(record["trials"], "scene", "iterations", "lights").items():
         kind = "lit" if lights > 1 else "baked"
         spent = statistics.mean(run["cpu_seconds"] for run in runs)
         sizes = [int(key[6:]) for key in runs[0] if key.startswith("frame_")]
         took = [f"{statistics.mean(run[f'frame_{size}'] for run in runs):.2f} at {size}" for size in sizes]
         made.row(
             scene,
+            f"{steps:,}",
             len(runs),
             kind,
             f"{runs[0]['model_bytes']:,}",
@@ -136,8 +139,7 @@ def table(record: Record) -> str:
             ", ".join(took) or "1",
             f"{spent:.0f}",
         )
-    counts = ", ".join(f"{n:,}" for n in sorted({run["iterations"] for run in record["trials"]}))
-    return "\n".join([*made.lines, "", f"{counts} steps; one thread of {record['cpu']}."])
+    return "\n".join([*made.lines, "", f"One thread of {record['cpu']}."])
 
 
 def main() -> None:

@@ -109,7 +109,8 @@ def vdb_decompressor(flags: int) -> Callable[[bytes, int], bytes]:
         claimed, length = sizes(chunk)
         if claimed != size or length != len(chunk):  # also what keeps the library from allocating gigabytes
             raise ValueError(
-                f"a Blosc chunk states that {length} bytes unpack to {claimed}; expected {len(chunk)} to {size}"
+                f"a Blosc chunk states that {length} bytes unpack to {claimed}; "
+                f"expected {len(chunk)} bytes that unpack to {size}"
             )
         if not size:
             return b""

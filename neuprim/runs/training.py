@@ -54,8 +54,9 @@ from neuprim.runs.open import discard_results
 
 CURVE_FILE, PREVIEW_FILE = "metrics.jsonl", "renders/preview.png"
 
-_PREVIEW_PROGRESS = (0.05, 0.5)
-"""Used fractions of the budget at which :data:`PREVIEW_FILE` is written; it is written again at the end of the run."""
+_PREVIEW_PROGRESS = (0.01, 0.5)
+"""Used fractions of the budget at which :data:`PREVIEW_FILE` is written; it is written again at the end of the run. The
+first one is early, so that a user soon sees whether scene and cameras are right."""
 
 BEGIN = 0.8
 """Progress of a run, 0..1. Fine-tuning begins with the values that the run's schedules have at this progress."""
@@ -187,7 +188,7 @@ def _train_and_save(fitted: Fitted, events: Events, between: BetweenSteps) -> bo
 
 
 class RunPreview:
-    """Callback between training steps that writes a picture of a held-out view at 5 % and 50 % of the training: ground
+    """Callback between training steps that writes a picture of a held-out view at 1 % and 50 % of the training: ground
     truth on the left, rendering on the right.
 
     Args:

@@ -329,7 +329,7 @@ def test_a_preview_is_written_while_a_run_trains_and_changes_nothing(scene: Path
 
     run(compose(words(scene, out)), listen, look)
     written = [i for i, (before, after) in enumerate(pairwise(seen)) if before != after]
-    assert written == [0.05 * STEPS, 0.5 * STEPS] and seen[0] is None and preview.read_bytes() != seen[-1]
+    assert written == [math.ceil(0.01 * STEPS), 0.5 * STEPS] and seen[0] is None and preview.read_bytes() != seen[-1]
     assert notes == [f"first picture (left ground truth, right model): {preview}"]
     assert_same_run(whole, out)
     (drawn,) = (p for p in (out / "renders").glob("test_001_*.png") if not p.stem.endswith(("_truth", "_error")))

@@ -196,9 +196,10 @@ class Capture:
             points = points or _sample_medium_points(lit.mean, frame.number)
             for c in (c for c, own in enumerate(lights) if own == light):
                 rgba = lit.render(self.cameras[c], self.samples)
-                peak = float(rgba[..., :3].max().half())  # as stored: values that half floats round to 0 are no light
+                exact = float(rgba.numpy()[..., :3].max())  # numpy: torch leaves OpenMP threads spinning
+                peak = float(torch.tensor(exact).half())  # as stored: values that half floats round to 0 are no light
                 if not np.isfinite(peak):
-                    found = f"a radiance of {float(rgba[..., :3].max()):.3g} does not fit the images' half floats"
+                    found = f"a radiance of {exact:.3g} does not fit the images' half floats"
                     settings = "scene.optics.emission, scene.optics.ambient or scene.optics.light"
                     raise DataError(f"{frame.path}: {found}; expected at most 65504; lower {settings}")
                 brightest = max(brightest, peak)

@@ -14,8 +14,9 @@ Units (metadata ``neuprim_units``):
 * ``world``: extinction per world unit, which a volume shader multiplies by a length
 * ``scene``: extinction per scene unit, i.e. sigma
 
-``velocity=true``, ``emission=true`` and ``albedo=true`` add vector grids (:mod:`neuprim.export.vector_grids`), and
-``usd=true`` a stage of the files (:mod:`neuprim.export.usd_volume`).
+The channels of the model, e.g. the temperature (``scene.channels``), are scalar grids of their own. ``velocity=true``,
+``emission=true`` and ``albedo=true`` add vector grids (:mod:`neuprim.export.vector_grids`), and ``usd=true`` adds a
+stage of the files (:mod:`neuprim.export.usd_volume`).
 """
 
 from __future__ import annotations
@@ -42,11 +43,12 @@ from neuprim.core.volumes.density_truth import (
     DensityGridPlacement,
     DensityGridSource,
     GridExtent,
+    measure_channel_errors,
     measure_density_errors,
 )
 from neuprim.export.shared import find_export_box
 from neuprim.export.usd_volume import write_usd_volume
-from neuprim.export.vector_grids import choose_look, choose_velocity
+from neuprim.export.vector_grids import choose_look, choose_velocity, sample_channels
 
 OPTIONS = {
     "grid": (None, "voxels along the longest side, 8 to 2048 (default: the source's own voxels, else 128)"),
@@ -100,6 +102,9 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
     origin = np.zeros(3) if placement else job.run.world.world_from_scene[:3, 3].numpy()
     fallback = _export_voxel_transform(job, box, scene_from_world, origin)
     sampler = _VdbExportSampler(job, _exported_component(job, placement), scene_from_world, name, factor, threshold)
+    channels = list(job.run.model.density.channels(job.run.model.params))
+    if name in channels:
+        raise ConfigError(f"name={name}: the model has a channel of this name; expected another name for the density")
     moving = choose_velocity(job, sampler.model, [f.conditions for f in frames], scene_from_world)
     look = choose_look(job, frames[0].conditions, per_world, scene_from_world)
     whole = sampler._replace(model=job.run.model)
@@ -113,28 +118,37 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
             transform = source.grid_transform(frame.source)
         transform = fallback if transform is None else transform
         grid = sampler.sample_grid(frame.conditions, transform)
-        vectors = []
-        if look is not None:  # flames glow where the exported extinction may be 0
-            lit = grid if sampler.model is whole.model else whole.sample_grid(frame.conditions, transform)
-            vectors += look.sample_grids(job.run.model, frame.conditions, replace(lit, half=job.flag("half")))
         if placement is not None and placement.extents:
             extents = placement.extents  # for a time between frames, the extent of all
             extent = GridExtent.around(extents) if frame.source is None else extents[frame.source]
             grid = _clamp_exported_grid(grid, extent, placement.sigma_per_unit * factor)
+        others = []
+        if look is not None or channels:  # flames glow where the exported extinction may be 0
+            lit = grid if sampler.model is whole.model else whole.sample_grid(frame.conditions, transform)
+            lit = replace(lit, half=job.flag("half"))
+            others += [] if look is None else look.sample_grids(job.run.model, frame.conditions, lit)
+            others += sample_channels(job.run.model, frame.conditions, lit, scene_from_world, job.run.settings.threads)
         more = {f"neuprim_{key}": float(v) for key, v in frame.conditions.items() if v.numel() == 1}
         grid = replace(grid, half=job.flag("half"), metadata={**metadata, **more})
         if moving is not None:
-            vectors.append(moving.sample_grid(sampler.model, frame.conditions, grid))
-        write_vdb(path, [grid, *vectors])
-        names, bounds = [g.name for g in (grid, *vectors)], grid.world_bounds()
+            others.append(moving.sample_grid(sampler.model, frame.conditions, grid))
+        write_vdb(path, [grid, *others])
+        names, bounds = [g.name for g in (grid, *others)], grid.world_bounds()
         boxes += [] if bounds is None else [bounds]
         if source is not None and frame.source is not None:
             errors |= _measure_vdb_errors(job, source, frame.source, frame.conditions)
+            found: dict[str, float] = {}
             truth = None if look is None else source.look(frame.source)
             if look is not None and truth is not None:
-                found = look.measure_errors(job.run.model, frame.conditions, truth)
-                errors |= {f"frame_{frame.number:04d}.{key}": value for key, value in found.items()}
+                found |= look.measure_errors(job.run.model, frame.conditions, truth)
+            known = source.channels(frame.source) if channels else None
+            if known is not None:
+                own_errors = measure_channel_errors(job.run.model, frame.conditions, known, job.run.settings.threads)
+                found |= {f"{n}.{key}": value for n, each in own_errors.items() for key, value in each.items()}
+            errors |= {f"frame_{frame.number:04d}.{key}": value for key, value in found.items()}
     notes.append(f"grid {name!r} in {units} units: extinction per scene unit = value x {1 / factor:g}")
+    if channels:
+        notes.append(f"channels {', '.join(channels)}: means of the primitives, weighted by extinction")
     if moving is not None:
         notes.append(f"grid 'vel' in {moving.unit}, mean of the primitives weighted by extinction")
     if placement is not None and not placement.exact:

@@ -1,10 +1,10 @@
-"""Vector grids of exported OpenVDB files: ``vel`` from the motion of the primitives, ``emission`` and ``albedo``."""
+"""Further grids of exported OpenVDB files: velocities of the primitives, emission, albedo, and channels."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -157,6 +157,29 @@ def choose_look(
     if isinstance(exposure, bool) or not isinstance(exposure, (int, float)) or not 0 < exposure < math.inf:
         raise DataError(f"{job.run.directory}: exposure {exposure!r} in the model's header; expected a number above 0")
     return LookExport(names, float(exposure), per_world, scene_from_world, job.run.settings.threads)
+
+
+def sample_channels(
+    model: Primitives, conditions: Conditions, extinction: VdbGrid, scene_from_world: np.ndarray, threads: int
+) -> list[VdbGrid]:
+    """Return one grid per channel of the model, with the active voxels of ``extinction``.
+
+    The value of a voxel is the mean of the primitives' values at its centre, weighted by their extinctions.
+    """
+    with torch.no_grad():
+        active = model.to(device.HOST).active(conditions)
+        channels = active.field.channels(active.own)
+        if not channels:
+            return []
+        form = active.field.lower(active.own, active.geometry, conditions)
+        weights = torch.cat([*channels.values()], 1)
+        sums = sum_at_voxels(active, form, weights, extinction, scene_from_world, threads)
+    values, grids = _ratio(sums[..., 1:], sums[..., :1]), list[VdbGrid]()
+    for name, own in channels.items():
+        part, values = (np.ascontiguousarray(x) for x in np.split(values, [own.shape[1]], -1))
+        scalar = replace(extinction, name=name, values=part[..., 0].copy(), metadata={})
+        grids.append(scalar if own.shape[1] == 1 else vector_grid(name, extinction, part, {}))
+    return grids
 
 
 def sum_at_voxels(

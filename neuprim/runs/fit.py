@@ -292,6 +292,9 @@ def make_run_trainer(job: Job, dataset: Dataset, loss: Loss, group: ProcessGroup
     """
     config, task = job.config, job.task
     if config.train.supervision == "images":  # no parameters that only points could train
+        if dataset.points is not None and dataset.points.channels:
+            found = "train.supervision=images: voxels are needed for scene.channels"
+            raise ConfigError(f"{found}; expected auto, both or voxels, or no channels")
         dataset = replace(dataset, points=None)
     source = job.plugins.task
     with attribute_errors(source, "build"):

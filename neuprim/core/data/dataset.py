@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, final
 
 import numpy as np
@@ -259,7 +260,8 @@ class PointSamples:
     source: Tensor | None  # (M, C) float32 extinction times isotropic source radiance; None trains the extinction only
     sigma_scale: float  # typical sigma inside matter; the loss divides errors of sigma by it
     source_scale: float = 1.0  # typical source inside matter; the loss divides errors of source by it
-    # name of a source grid -> the (M,) part of sigma that comes from this grid, and the typical value of this part
+    # name of a source grid -> the (M,) part of sigma that comes from this grid, and the typical value of this part;
+    # name of a channel, after fields.CHANNEL -> (M, C) sigma times the values of the channel, and its typical value
     components: Mapping[str, tuple[Tensor, float]] = field(default_factory=dict)
     # (M, C) float32 extinction times the radiance that is scattered per irradiance of an unoccluded light; None trains
     # scattering on images only
@@ -271,6 +273,8 @@ class PointSupervision(ABC):
     """Base class of objects that draw points of a volume with ground truth, to train on points besides images."""
 
     components: tuple[str, ...] = ()  # names of the source grids in PointSamples.components
+    channels: Mapping[str, tuple[float, int]] = MappingProxyType({})
+    """Name of each channel (grid besides the extinction) -> its largest absolute value, and its numbers per voxel."""
 
     @abstractmethod
     def draw(self, count: int, generator: torch.Generator) -> PointSamples:

@@ -14,7 +14,7 @@ from neuprim.core.cameras.pinhole import AnyCamera, RayCamera
 from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset, DataSource, Pixels, PointCloud, PointSamples, PointSupervision, View, ViewSet
 from neuprim.core.errors import DataError
-from neuprim.core.model.fields import ConditionSpec
+from neuprim.core.model.fields import CHANNEL, ConditionSpec
 from neuprim.core.volumes.density_truth import DensityGridPlacement
 
 __all__ = ["DatasetError", "check_dataset_views", "get_extra"]
@@ -91,7 +91,8 @@ def check_point_samples(samples: PointSamples, dataset: Dataset) -> None:
         _check_dataset_tensor(f"{where}: source", samples.source, torch.float32, (count, dataset.channels))
     scales = {"sigma_scale": samples.sigma_scale, "source_scale": samples.source_scale}
     for name, (value, scale) in samples.components.items():
-        _check_dataset_tensor(f"{where}: component {name}", value, torch.float32, (count,))
+        columns = value.shape[1:] if name.startswith(CHANNEL) else ()
+        _check_dataset_tensor(f"{where}: component {name}", value, torch.float32, (count, *columns))
         scales[f"scale of component {name}"] = scale
     for name, scale in scales.items():
         _check_positive_dataset_number(f"{where}: {name}", scale)

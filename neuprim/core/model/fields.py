@@ -185,6 +185,10 @@ def read_script(package: str, name: str) -> str:
     return resources.files(package).joinpath(name).read_text(encoding="utf-8")
 
 
+CHANNEL = "channel_"
+"""Prefix of a channel's name where parameters, or components of samples, also have names."""
+
+
 class DensityField(Field):
     """Base class of density fields: the extinction sigma inside each primitive, 1/scene unit.
 
@@ -213,6 +217,13 @@ class DensityField(Field):
 
         Only fields fitted to several voxel grids have components (:attr:`neuprim.core.data.PointSamples.components`).
         Images do not depend on the fractions.
+        """
+        return {}
+
+    def channels(self, params: Params) -> dict[str, Tensor]:
+        """Return channel name -> (N, C) values of each primitive, e.g. its temperature (C = 1) or velocity (C = 3).
+
+        A channel is a grid of the training data besides the extinction. Images do not depend on channels.
         """
         return {}
 

@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from neuprim.core.errors import DataError
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes.density_grid import density_grid
+from neuprim.core.volumes.points import channel_values_at
 
 __all__ = ["DensityGridPlacement", "DensityGridSource", "DensityTruth", "GridExtent", "TruthFrame"]
 
@@ -174,6 +176,13 @@ class VoxelLook(NamedTuple):
     scattered: np.ndarray | None  # (M, 3) extinction times scattering albedo
 
 
+class VoxelChannels(NamedTuple):
+    """Values of the channels (grids besides the extinction) at M voxels of a frame that absorb light."""
+
+    points: np.ndarray  # (M, 3) float64 centres, scene units
+    values: dict[str, np.ndarray]  # name -> (M, C) values
+
+
 class DensityGridSource(DensityTruth):
     """Base class of ground truth in voxel files, read one frame at a time."""
 
@@ -185,6 +194,10 @@ class DensityGridSource(DensityTruth):
 
     def look(self, frame: int) -> VoxelLook | None:
         """Return the emission and scattering of a frame's voxels; None if they are unknown or the frame is empty."""
+        return None
+
+    def channels(self, frame: int) -> VoxelChannels | None:
+        """Return the values of a frame's channels; None if there are no channels or the frame is empty."""
         return None
 
     @abstractmethod
@@ -217,15 +230,15 @@ class DensityComparison:
         self.sums += (a.sum(), b.sum(), a @ a, b @ b, a @ b)
         self.error += float(wrong @ wrong)
         self.error_active += float(inside @ inside)
-        self.peak = max(self.peak, float(a.max(initial=0.0)))
+        self.peak = max(self.peak, float(np.abs(a).max(initial=0.0)))
         self.worst = max(self.worst, float(np.abs(wrong).max(initial=0.0)))
 
     def errors(self) -> dict[str, float] | None:
         """Return name -> value for each of :data:`DENSITY_ERRORS`; None if the truth is the same everywhere.
 
         ``correlation`` is Pearson's and ``relative_l2`` is |values - truth| / |truth|, both over all points.
-        ``psnr_active`` is the PSNR in dB over the points where the truth is not 0; the peak is the largest true value.
-        ``max_error`` is the largest absolute error of all points, divided by the same peak.
+        ``psnr_active`` is the PSNR in dB over the points where the truth is not 0; the peak is the largest absolute
+        value of the truth. ``max_error`` is the largest absolute error of all points, divided by the same peak.
         """
         n = max(self.points, 1)
         a, b, aa, bb, ab = (float(x) for x in self.sums)
@@ -263,6 +276,24 @@ def measure_density_errors(
         sigma = truth.grid(frame, matrix, shape, component).numpy()
         comparison.add_block(sigma, density_grid(model, conditions, matrix, shape, threads).numpy())
     return comparison.errors()
+
+
+def measure_channel_errors(
+    model: Primitives, conditions: Conditions, truth: VoxelChannels, threads: int = 0
+) -> dict[str, dict[str, float]]:
+    """Return channel name -> errors of the model's values at the voxels of ``truth``, for one frame.
+
+    The errors are those of :meth:`DensityComparison.errors`. Channels that are constant in this frame are left out.
+    """
+    own = channel_values_at(model, conditions, torch.from_numpy(truth.points), threads)
+    found = {}
+    for name, values in truth.values.items():
+        comparison = DensityComparison()
+        if name in own:
+            comparison.add_block(values, own[name].numpy())
+        if errors := comparison.errors():
+            found[name] = errors
+    return found
 
 
 def split_density_grid_planes(

@@ -9,7 +9,7 @@ compiled code. For any other density, torch code evaluates each pair of point an
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -18,7 +18,7 @@ from torch import Tensor
 from neuprim.core.compute import device
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.cosine import cosine_density
-from neuprim.core.model.fields import Conditions, Cosine, LoweredDensity
+from neuprim.core.model.fields import CHANNEL, Conditions, Cosine, LoweredDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import ActivePrimitives, Primitives
 from neuprim.core.volumes.points_cpu import NOT_FINITE, CosinePointValues, PointCells, sort_points_into_cells
@@ -48,7 +48,8 @@ class PointValues(NamedTuple):
             depends on direction.
         rows: (N,) int64 rows of the primitives that are active in the frame, None for all.
         shares: contributions of the active primitives; zeros until a backward pass.
-        components: name of a source grid -> (M,) part of sigma that comes from this grid.
+        components: name of a source grid -> (M,) part of sigma that comes from this grid; name of a channel, after
+            :data:`~neuprim.core.model.fields.CHANNEL` -> (M, C) sum of sigma_i times the values of primitive i.
         scattered: (M, C) sum of sigma_i times :meth:`~neuprim.core.model.fields.ColourField.scattering`; None if
             ``source`` is None, or if the field does not separate scattered light.
     """
@@ -91,23 +92,25 @@ def volume_values_at(
     isotropic = model.colour.isotropic(colour_params, conditions) if colour else None
     scattering = None if isotropic is None else model.colour.scattering(colour_params)
     named = model.density.components(active.own)
+    named |= {CHANNEL + name: values for name, values in model.density.channels(active.own).items()}
     columns = [x for x in (isotropic, scattering) if x is not None]
     widths = [0 if x is None else x.shape[1] for x in (isotropic, scattering)]
-    columns += [share[:, None] for share in named.values()]
+    columns += [factor.reshape(count, -1) for factor in named.values()]
     weights = torch.cat(columns, 1) if columns else geometry.means.new_zeros(count, 0)
     form = model.density.lower(active.own, geometry, conditions)
+    shapes = {name: factor.shape[1:] for name, factor in named.items()}
     shares = PointShares(count, geometry.means.device)
     if compiled and isinstance(form, Cosine):
         from neuprim.core.volumes.points_warp import cosine_point_values
 
         values = cosine_point_values(geometry, form, points, weights, shares)
-        return _point_values(values, widths, active.rows, shares, tuple(named))
+        return _point_values(values, widths, active.rows, shares, shapes)
     try:
         values = weighted_extinctions_at(active, form, points, weights, shares, threads)
     except NonFiniteError:
         model.check_finite()  # names the parameter, if it is one
         raise
-    return _point_values(values, widths, active.rows, shares, tuple(named))
+    return _point_values(values, widths, active.rows, shares, shapes)
 
 
 def weighted_extinctions_at(
@@ -143,15 +146,34 @@ def weighted_extinctions_at(
     return values
 
 
-def _point_values(
-    values: Tensor, widths: Sequence[int], rows: Tensor | None, shares: PointShares, named: tuple[str, ...]
-) -> PointValues:
-    """Split the columns of ``values``: extinction, source radiance, scattered radiance and ``named`` components.
+def channel_values_at(model: Primitives, conditions: Conditions, points: Tensor, threads: int = 0) -> dict[str, Tensor]:
+    """Return channel name -> (M, C) float32 values of a model at ``points`` (M, 3), scene units, in one frame.
 
-    ``widths`` are the numbers of columns of the two radiances, 0 for none.
+    A value is the mean over primitives, weighted by their extinctions; 0 where no primitive absorbs.
     """
-    sigma, source, scattered, components = values.split([1, *widths, len(named)], 1)
-    parts = dict(zip(named, components.unbind(1), strict=True))
+    with torch.no_grad():
+        active = model.to(device.HOST).active(conditions)
+        channels = active.field.channels(active.own)
+        if not channels:
+            return {}
+        form = active.field.lower(active.own, active.geometry, conditions)
+        sums = weighted_extinctions_at(active, form, points, torch.cat([*channels.values()], 1), threads=threads)
+        values = sums[:, 1:] / sums[:, :1].clamp_min(torch.finfo(torch.float32).tiny)
+        widths = [own.shape[1] for own in channels.values()]
+    return dict(zip(channels, values.split(widths, 1), strict=True))
+
+
+def _point_values(
+    values: Tensor, widths: Sequence[int], rows: Tensor | None, shares: PointShares, shapes: Mapping[str, torch.Size]
+) -> PointValues:
+    """Split the columns of ``values``: extinction, source radiance, scattered radiance and components.
+
+    ``widths`` are the numbers of columns of the two radiances, 0 for none. ``shapes`` are the shapes of the components
+    at a point, by name.
+    """
+    sigma, source, scattered, *components = values.split([1, *widths, *(s.numel() for s in shapes.values())], 1)
+    found = zip(shapes.items(), components, strict=True)
+    parts = {name: part.reshape(len(values), *shape) for (name, shape), part in found}
     light = [x if x.shape[1] else None for x in (source, scattered)]
     return PointValues(sigma[:, 0], light[0], rows, shares, parts, light[1])
 

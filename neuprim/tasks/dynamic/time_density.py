@@ -15,7 +15,9 @@ A model joined from chunks of a sequence stores the chunk number of every primit
 time. During an overlap, the earlier chunk's weight falls linearly from 1 to 0, and the later one's rises from 0 to 1.
 
 If the extinction comes from several grids (smoke and flames), each name in ``components`` adds one parameter,
-share_NAME: the fraction of the primitive's extinction that belongs to that grid, as a logit.
+share_NAME: the fraction of the primitive's extinction that belongs to that grid, as a logit. Each name in ``channels``
+adds one parameter, channel_NAME: the value of another grid, such as the temperature or the velocity, divided by its
+largest absolute value.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ from neuprim.core.model.cosine import (
     split_cosine,
     split_density_scale,
 )
-from neuprim.core.model.fields import Conditions, Cosine, DensityField, read_script
+from neuprim.core.model.fields import CHANNEL, Conditions, Cosine, DensityField, read_script
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
@@ -106,6 +108,7 @@ class TimeDensity(DensityField):
     Args:
         seams: overlaps in time of the chunks from which a model was joined; empty for other models.
         components: names of the source grids whose share of the extinction each primitive stores.
+        channels: name of each channel, its largest absolute value in the source, and its numbers per voxel (1 or 3).
     """
 
     init_settings = (*CosineDensity.init_settings, "window", "window_frames", "rate")
@@ -114,6 +117,7 @@ class TimeDensity(DensityField):
     def __init__(
         self, neurons: int = 8, time: str = "phase", omega0: float = OMEGA0, edge: int = 0, gain: bool = False,
         seams: Sequence[Sequence[float]] = (), components: Sequence[str] = (),
+        channels: Sequence[Sequence[Any]] = (),
     ) -> None:  # fmt: skip
         parts = time.split("+") if isinstance(time, str) and time != "none" else []
         if not isinstance(time, str) or any(p not in TIME_PARTS for p in parts) or len(set(parts)) != len(parts):
@@ -125,6 +129,7 @@ class TimeDensity(DensityField):
         if isinstance(components, str) or not all(isinstance(name, str) and name.isidentifier() for name in components):
             raise ValueError(f"components {components!r}; expected a list of names")
         self.named = tuple(components)
+        self.sizes = _validate_channels(channels)
 
     def settings(self) -> dict[str, Any]:
         settings = {**self.static.settings(), "time": self.time}
@@ -132,12 +137,14 @@ class TimeDensity(DensityField):
             settings["seams"] = [list(overlap) for overlap in self.seams]
         if self.named:
             settings["components"] = list(self.named)
+        if self.sizes:
+            settings["channels"] = [[name, size, width] for name, (size, width) in self.sizes.items()]
         return settings
 
     @classmethod
     def every_parameter(cls) -> list[ParameterSpec]:
-        every = cls(time="+".join(TIME_PARTS), gain=True, seams=[(0.0, 1.0)], components=("density", "temperature"))
-        return every.parameters()
+        grids: dict[str, Any] = {"components": ("density", "temperature"), "channels": [("temperature", 1.0, 1)]}
+        return cls(time="+".join(TIME_PARTS), gain=True, seams=[(0.0, 1.0)], **grids).parameters()
 
     def parameters(self) -> list[ParameterSpec]:
         K = self.static.neurons
@@ -155,10 +162,15 @@ class TimeDensity(DensityField):
         if self.seams:
             specs.append(ParameterSpec("chunk", (1,), 0.0, _zero_time_parameters(1)))
         specs += [ParameterSpec(_SHARE + name, (1,), 0.3, _zero_time_parameters(1)) for name in self.named]
+        for name, (_, width) in self.sizes.items():
+            specs.append(ParameterSpec(CHANNEL + name, (width,), 3e-2, _zero_time_parameters(width)))
         return specs
 
     def components(self, params: Params) -> dict[str, Tensor]:
         return {name: params[_SHARE + name].sigmoid().reshape(-1) for name in self.named}
+
+    def channels(self, params: Params) -> dict[str, Tensor]:
+        return {name: params[CHANNEL + name] * size for name, (size, _) in self.sizes.items()}
 
     def largest(self, params: Params, geometry: Geometry) -> Tensor:
         changed = dict(params)
@@ -268,6 +280,19 @@ class TimeDensity(DensityField):
             if name in params:
                 scaled[name] = params[name] * factor[:, None]
         return scaled
+
+
+def _validate_channels(channels: Sequence[Sequence[Any]]) -> dict[str, tuple[float, int]]:
+    """Convert (name, largest absolute value, numbers per voxel) to a dict; raise ValueError if anything is wrong."""
+    try:
+        sizes = {str(name): (float(size), int(width)) for name, size, width in channels}
+        sound = all(name.isidentifier() for name in sizes) and len(sizes) == len(channels)
+        sound = sound and all(0 < size < math.inf and width in (1, 3) for size, width in sizes.values())
+    except (TypeError, ValueError, OverflowError):
+        sound = False
+    if not sound:
+        raise ValueError(f"channels {channels!r}; expected a name, a number above 0, and 1 or 3, for each")
+    return sizes
 
 
 def _advance_phase_in_time(b1: Tensor, W_t: Tensor, xi: Tensor, turn: float) -> Tensor:

@@ -28,12 +28,12 @@ from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io.exr import write_exr
 from neuprim.core.io.files import write_json
 from neuprim.core.io.store import Store
-from neuprim.core.io.vdb import VdbFrame
+from neuprim.core.io.vdb import VdbFrame, read_grids, read_header
 from neuprim.core.volumes.density_truth import (
     DensityGridPlacement,
     GridExtent,
 )
-from neuprim.tasks.dynamic.volume.lit_medium import LitMedium, build_medium, draw_lights
+from neuprim.tasks.dynamic.volume.lit_medium import LitMedium, build_medium, draw_lights, sample_vdb_grid
 from neuprim.tasks.dynamic.volume.medium import Medium
 from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Light, Optics
 from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation, GridReader
@@ -65,6 +65,7 @@ class Capture:
         bounds: (2, 3) box around all matter, scene units.
         ends: numbers of the frames with time 0 and 1; None for the first and the last frame.
         measured: frame number -> extent of its extinction grid; empty if unknown.
+        channels: names of the grids that models learn besides the look -> largest absolute value, numbers per voxel.
     """
 
     frames: Sequence[VdbFrame]
@@ -78,6 +79,7 @@ class Capture:
     held_out: int = 0
     ends: tuple[int, int] | None = None
     measured: Mapping[int, GridExtent] = field(default_factory=dict)
+    channels: Mapping[str, tuple[float, int]] = field(default_factory=dict)
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -131,6 +133,19 @@ class Capture:
             return build_medium(grids, optics, self.normalisation.matrix())
         except DataError as error:
             raise DataError(f"{frame.path}: {error}") from error
+
+    def read_channels(self, frame: VdbFrame, points: np.ndarray) -> dict[str, np.ndarray]:
+        """Return name -> (M, C) float32 values of each channel at ``points`` (M, 3), scene units.
+
+        Values are trilinear between voxels, and 0 where the file has none. Raises DataError if the file is damaged.
+        """
+        back = np.linalg.inv(self.normalisation.matrix())
+        world = points @ back[:3, :3].T + back[:3, 3]
+        stored = {grid.name for grid in read_header(frame.path).grids}
+        found = {name: np.zeros((len(points), width), np.float32) for name, (_, width) in self.channels.items()}
+        for grid in read_grids(frame.path, [name for name in self.channels if name in stored]):
+            found[grid.name] = sample_vdb_grid(grid, world)
+        return found
 
     def placement(self) -> DensityGridPlacement:
         """Return the scene's position in the world of its .vdb files, with frame numbers, times and grid names."""

@@ -19,7 +19,9 @@ from neuprim.core.volumes.density_truth import (
     DENSITY_ERRORS,
     DensityGridSource,
     TruthFrame,
+    VoxelChannels,
     VoxelLook,
+    measure_channel_errors,
     measure_density_errors,
 )
 from neuprim.tasks.dynamic.volume.capture import Capture
@@ -115,6 +117,13 @@ class CaptureDensity(DensityGridSource):
         scattered = None if capture.lights == 1 or medium.scattered is None else medium.scattered[where]
         return VoxelLook(points, medium.values[where][:, 1:], scattered)
 
+    def channels(self, frame: int) -> VoxelChannels | None:
+        capture, medium = self.capture, self.medium(frame)
+        if not capture.channels or medium.empty:
+            return None
+        points, _ = medium.voxels(medium.values[..., 0] > 0)
+        return VoxelChannels(points, capture.read_channels(self._files[frame], points))
+
     def open_files(self, path: Path) -> CaptureDensity:
         return CaptureDensity(self.capture, path)
 
@@ -126,21 +135,29 @@ def compare_capture_extinction(model: Primitives, capture: Capture, times: list[
     ``times`` has the time of every frame. In the result, "sigma_frames" has the errors of each compared frame, see
     :func:`~neuprim.core.volumes.density_truth.measure_density_errors`. There are also means over the early, middle and
     late third of the sequence, each over three evenly spaced frames. Frames without extinction are left out. If flames
-    add to the extinction of a grid, the errors of the grid's own part are also measured: "density_frames", ...
+    add to the extinction of a grid, the errors of the grid's own part are also measured: "density_frames", ... Channels
+    are measured at the voxels with extinction: "temperature_frames", ...
     """
-    result: dict[str, Any] = {}
     count, truth, compared = len(capture.frames), CaptureDensity(capture), 3 * _COMPARED_PER_THIRD
-    for component in (None, *model.density.components(model.params)):
-        entries: list[dict[str, Any]] = []
-        for t in sorted({int((i + 0.5) * count / compared) for i in range(compared)}):
-            conditions = {"time": torch.tensor(times[t])}
-            errors = measure_density_errors(model, conditions, truth, t, component=component)
+    components = model.density.components(model.params)
+    entries: dict[str, list[dict[str, Any]]] = {name: [] for name in ("sigma", *components, *capture.channels)}
+    for t in sorted({int((i + 0.5) * count / compared) for i in range(compared)}):
+        conditions = {"time": torch.tensor(times[t])}
+        found = {
+            component or "sigma": measure_density_errors(model, conditions, truth, t, component=component)
+            for component in (None, *components)
+        }
+        channels = truth.channels(t)
+        found |= {} if channels is None else measure_channel_errors(model, conditions, channels)
+        for name, errors in found.items():
             if errors is not None:
-                entries.append({"frame": capture.frames[t].number, "third": THIRDS[min(3 * t // count, 2)], **errors})
-        name = component or "sigma"
-        result[f"{name}_frames"] = entries
+                third = THIRDS[min(3 * t // count, 2)]
+                entries[name].append({"frame": capture.frames[t].number, "third": third, **errors})
+    result: dict[str, Any] = {}
+    for name, own in entries.items():
+        result[f"{name}_frames"] = own
         for key in DENSITY_ERRORS:
             for third in THIRDS:
-                values = [e[key] for e in entries if e["third"] == third]
+                values = [e[key] for e in own if e["third"] == third]
                 result[f"{name}_{key}_{third}"] = float(np.mean(values)) if values else None
     return result

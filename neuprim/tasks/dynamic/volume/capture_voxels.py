@@ -7,7 +7,7 @@ import itertools
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -20,6 +20,7 @@ from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io.json_reader import read_npz_arrays
 from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
+from neuprim.core.model.fields import CHANNEL
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.lit_medium import light_medium
 from neuprim.tasks.dynamic.volume.medium import Medium
@@ -75,12 +76,14 @@ class MediumVoxels:
             part of sigma that comes from the extinction grid; if the model lights the voxels, this part times the RGB
             albedo.
         scene_from_index: (4, 4) float64 matrix from voxel indices to scene coordinates.
+        channels: (V, C) float32 columns: sigma times the value of each channel. :meth:`write` leaves them out.
     """
 
     index: np.ndarray
     values: np.ndarray
     shape: tuple[int, int, int]
     scene_from_index: np.ndarray
+    channels: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
     @staticmethod
     def of(medium: Medium, lit: bool = False) -> MediumVoxels:
@@ -111,6 +114,9 @@ class MediumVoxels:
         index, values = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         return MediumVoxels(index, values, bricks.shape, medium.scene_from_index)
 
+    def count_bytes(self) -> int:
+        return self.index.nbytes + self.values.nbytes + self.channels.nbytes
+
     @property
     def has_part(self) -> bool:
         """Whether the extinction grid's part of sigma is stored, in column 4."""
@@ -131,6 +137,11 @@ class MediumVoxels:
         part = squares[4] if self.has_part else 0.0
         scattered = squares[-3:].mean() if self.has_albedo else 0.0
         return tuple(float(np.sqrt(x)) for x in (squares[0], squares[1:4].mean(), part, scattered))  # type: ignore[return-value]
+
+    @functools.cached_property
+    def channel_squares(self) -> np.ndarray:
+        """Mean square of each column of :attr:`channels` over all voxels; 0 if there are no voxels."""
+        return np.square(self.channels, dtype=np.float64).sum(0) / max(len(self.index), 1)
 
     def write(self, path: Path) -> None:
         """Write the voxels to an .npz file; raises OSError."""
@@ -158,15 +169,27 @@ class MediumVoxels:
             )
         return MediumVoxels(index, values, (x, y, z), matrix)
 
-    def values_at_cells(self, cells: np.ndarray) -> np.ndarray:
-        """Return (M, C) values of the voxels with integer indices ``cells`` (M, 3); 0 for empty voxels."""
-        values = np.zeros((len(cells), self.values.shape[1]), np.float32)
+    def find_cells(self, cells: np.ndarray) -> np.ndarray:
+        """Return (M,) int64 rows of the voxels with integer indices ``cells`` (M, 3); -1 for empty voxels."""
+        rows = np.full(len(cells), -1, np.int64)
         inside = ((cells >= 0) & (cells < np.array(self.shape))).all(1)
         if len(self.index) and inside.any():
             flat = np.ravel_multi_index(tuple(cells[inside].T), self.shape)
             place = np.searchsorted(self.index, flat).clip(max=len(self.index) - 1)
-            values[inside] = np.where((self.index[place] == flat)[:, None], self.values[place], np.float32(0))
-        return values
+            rows[inside] = np.where(self.index[place] == flat, place, -1)
+        return rows
+
+    def centers(self) -> np.ndarray:
+        """Return the (V, 3) float64 centres of the voxels, scene units."""
+        cells = np.stack(np.unravel_index(self.index, self.shape), -1)
+        return cells @ self.scene_from_index[:3, :3].T + self.scene_from_index[:3, 3]
+
+
+def take_voxel_rows(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return (M, C): the ``rows`` (M,) of ``values`` (V, C); 0 where a row is -1."""
+    found = np.zeros((len(rows), values.shape[1]), np.float32)
+    found[rows >= 0] = values[rows[rows >= 0]]
+    return found
 
 
 class FrameVoxels(PointSupervision):
@@ -193,11 +216,12 @@ class FrameVoxels(PointSupervision):
         weights: Sequence[float],
         memory: float,
     ) -> None:
-        self.capture, self.folder, self.exposure, self.components = capture, folder, exposure, capture.components
+        self.capture, self.folder, self.exposure = capture, folder, exposure
+        self.components, self.channels = capture.components, capture.channels
         self.frames, self.times = [frame for frame, _ in frames], [time for _, time in frames]
         shares = torch.tensor(weights, dtype=torch.float64)
         self.chances = (1 - _ANY_FRAME) * shares / shares.sum().clamp_min(1e-300) + _ANY_FRAME / len(self.frames)
-        self._voxels = RecentFrames(self._read_voxels, lambda v: v.index.nbytes + v.values.nbytes, memory)
+        self._voxels = RecentFrames(self._read_voxels, MediumVoxels.count_bytes, memory)
 
     def draw(self, count: int, generator: torch.Generator) -> PointSamples:
         t = int(torch.multinomial(self.chances, 1, generator=generator))
@@ -211,13 +235,14 @@ class FrameVoxels(PointSupervision):
         places = low - margin + uniform * (high - low + 2 * margin)
         back = np.linalg.inv(voxels.scene_from_index)
         cells = np.rint(places @ back[:3, :3].T + back[:3, 3]).astype(np.int64)
-        known = np.zeros((0, voxels.values.shape[1]), np.float32)
+        known = np.zeros(0, np.int64)
         if far < count:
             rows = torch.randint(len(voxels.index), (count - far,), generator=generator).numpy()
             chosen = np.stack(np.unravel_index(voxels.index[rows], voxels.shape), -1)
             chosen[:near] += torch.randint(-_MAX_OFFSET, _MAX_OFFSET + 1, (near, 3), generator=generator).numpy()
-            cells, known = np.concatenate([cells, chosen]), voxels.values[rows[near:]]
-        values = np.concatenate([voxels.values_at_cells(cells[: count - len(known)]), known])
+            cells, known = np.concatenate([cells, chosen]), rows[near:]
+        places = np.concatenate([voxels.find_cells(cells[: count - len(known)]), known])
+        values = take_voxel_rows(voxels.values, places)
         points = cells @ voxels.scene_from_index[:3, :3].T + voxels.scene_from_index[:3, 3]
         sigma, light, part, scattered = voxels.rms
         fallback = self.capture.optics.extinction or 1.0  # for empty frames
@@ -233,10 +258,24 @@ class FrameVoxels(PointSupervision):
             source=torch.from_numpy(values[:, 1:4] / exposure),
             sigma_scale=sigma or fallback,
             source_scale=(light or fallback) / self.exposure,
-            components=dict.fromkeys(self.components, (parts, part or sigma or fallback)),
+            components=dict.fromkeys(self.components, (parts, part or sigma or fallback))
+            | self._draw_channels(voxels, places, sigma or fallback),
             scattered=None if albedo is None else torch.from_numpy(albedo / (_SPHERE * exposure)),
             scattered_scale=(scattered or fallback) / self.exposure,
         )
+
+    def _draw_channels(self, voxels: MediumVoxels, rows: np.ndarray, sigma: float) -> dict[str, tuple[Tensor, float]]:
+        """Return the channels of :attr:`PointSamples.components` for drawn rows of voxels (-1: empty voxels)."""
+        if not self.channels:
+            return {}
+        drawn = torch.from_numpy(take_voxel_rows(voxels.channels, rows))
+        found, first = dict[str, tuple[Tensor, float]](), 0
+        for name, (size, width) in self.channels.items():
+            columns = slice(first, first + width)
+            typical = float(voxels.channel_squares[columns].mean()) ** 0.5 or sigma * size
+            found[CHANNEL + name] = (drawn[:, columns].contiguous(), typical)
+            first += width
+        return found
 
     def _light_scales(self, emitted: float, scattered: float) -> tuple[float, float]:
         """Return two scales, by which the loss divides errors of emitted light, and of light scattered per irradiance.
@@ -256,7 +295,12 @@ class FrameVoxels(PointSupervision):
         return total, total / irradiance
 
     def _read_voxels(self, t: int) -> MediumVoxels:
-        return self.folder.retry(lambda: self._read_or_make_voxels(self.frames[t]), warn_once)
+        frame = self.frames[t]
+        voxels = self.folder.retry(lambda: self._read_or_make_voxels(frame), warn_once)
+        if not self.channels:
+            return voxels
+        values = self.capture.read_channels(frame, voxels.centers())
+        return replace(voxels, channels=voxels.values[:, :1] * np.concatenate(list(values.values()), 1))
 
     def _supervised_medium(self, frame: VdbFrame) -> Medium:
         """Return the medium with whose voxels a model is compared in training.

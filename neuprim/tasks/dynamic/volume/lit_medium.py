@@ -227,6 +227,25 @@ class _MediumGrid:
         return found
 
 
+def sample_vdb_grid(grid: VdbGrid, points: np.ndarray) -> np.ndarray:
+    """Return the (M, C) float32 values of a grid at ``points`` (M, 3), world coordinates, trilinear between voxels.
+
+    Values are 0 outside the grid's voxels, and where they are not finite. In a staggered grid, component a of a voxel
+    is the value half a voxel before the voxel's centre along axis a.
+    """
+    if grid.bounds is None:
+        return np.zeros((len(points), grid.channels), np.float32)
+    own = _MediumGrid.in_bricks([grid], grid.transform, grid.bounds)
+    values = read_bricks(grid, own.first, own.bricks)
+    values = values.reshape(*values.shape[:4], grid.channels)
+    values[~np.isfinite(values)] = 0.0
+    back = np.linalg.inv(grid.transform)
+    index = points @ back[:3, :3].T + back[:3, 3] - own.first
+    shifts = 0.5 * np.eye(3) if grid.kind == "staggered" else np.zeros((grid.channels, 3))
+    found = [own.bricks.sample(np.ascontiguousarray(values[..., c]), index + shifts[c]) for c in range(grid.channels)]
+    return np.stack(found, -1)
+
+
 def _transform_boxes(boxes: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Convert boxes (M, 2, 3) of :func:`grid_boxes` to voxels of another grid, with a margin of one voxel.
 

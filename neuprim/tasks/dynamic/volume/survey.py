@@ -132,6 +132,34 @@ def find_volume_grids(frames: Sequence[VdbFrame], chosen: Mapping[str, str]) -> 
     return GridReader(names, level_sets=frozenset(level_sets & set(chosen.values())))
 
 
+def measure_vdb_channels(
+    frames: Sequence[VdbFrame], names: Sequence[str], progress: Callable[[str, float], None]
+) -> dict[str, tuple[float, int]]:
+    """Return the largest absolute value of each of the grids ``names`` in all frames, and its numbers per voxel.
+
+    Raises:
+        DataError: no frame has a grid, or a grid cannot be read, is 0 everywhere, or differs in numbers per voxel.
+    """
+    found: dict[str, tuple[float, int]] = {}
+    folder, stored = frames[0].path.parent, set[str]()
+    for i, frame in enumerate(frames if names else ()):
+        progress("measuring channels", i / len(frames))
+        in_file = {grid.name for grid in read_header(frame.path).grids}
+        stored |= in_file
+        for grid in read_grids(frame.path, [name for name in names if name in in_file]):
+            largest, width = found.get(grid.name, (0.0, grid.channels))
+            if grid.channels != width:
+                what = f"grid {grid.name!r} has {grid.channels} numbers per voxel"
+                raise DataError(f"{frame.path}: {what}; expected {width}, as in earlier frames")
+            values = grid.active_values()
+            found[grid.name] = max(largest, float(np.abs(values[np.isfinite(values)]).max(initial=0.0))), width
+    for name in names:
+        if not found.get(name, (0.0, 1))[0]:
+            problem = "the grid is 0 in all frames" if name in found else "no frame has such a grid"
+            raise DataError(f"{folder}: scene.channels={name}: {problem}{nearest(name, stored - {name})}")
+    return found
+
+
 # ---------------------------------------------------------------- measuring
 
 

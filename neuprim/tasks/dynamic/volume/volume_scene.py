@@ -55,6 +55,7 @@ from neuprim.tasks.dynamic.volume.survey import (
     CaptureNormalisation,
     data_dependent_optics,
     find_volume_grids,
+    measure_vdb_channels,
     survey_volume_frames,
 )
 
@@ -76,6 +77,9 @@ Frames = Annotated[
 ]
 
 
+Channel = Annotated[str, Accepts(str.isidentifier, "the name of a grid, of letters, digits and underscores")]
+
+
 @dataclass(frozen=True)
 class VdbSceneSettings:
     """Settings of a volume scene.
@@ -91,6 +95,8 @@ class VdbSceneSettings:
         chunks: number of time chunks, each trained in its own run; None or 1 for one run. For "auto" see
             :func:`count_time_chunks`.
         grids: meaning ("density", "flames", ...) -> name of the grid in the files.
+        channels: names of grids in the files whose values the model also learns, e.g. the temperature or the velocity,
+            to export them again.
         look: name of a preset of the optics, or "auto".
         optics: changes to the preset's settings.
         size: width and height of the images in pixels.
@@ -114,6 +120,7 @@ class VdbSceneSettings:
     span: Span | None = None
     chunks: Annotated[int, Range(1, 1000)] | Literal["auto"] | None = None
     grids: Mapping[GridMeaning, Annotated[str, nonempty_text("the name of a grid")]] = field(default_factory=dict)
+    channels: tuple[Channel, ...] = ()
     look: str = "auto"
     optics: Mapping[str, Any] = field(default_factory=dict)
     size: Annotated[int, Range(8, 4096)] = 160
@@ -256,6 +263,7 @@ def _prepare_vdb_scene(
     optics = options.resolve_optics("density" in reader.names)
     reader = reader.with_extinction(optics.extinction_grids, folder)
     measured: Mapping[int, GridExtent] = {}
+    channels: Mapping[str, tuple[float, int]] = {}
     train, test = hemisphere_capture_cameras(
         options.size, options.cameras, up=options.up, field_of_view=options.field_of_view
     )
@@ -266,6 +274,9 @@ def _prepare_vdb_scene(
         if options.vdb is not None:
             derived = data_dependent_optics(optics, reader.extinction, survey)
             optics = replace(optics, **{key: value for key, value in derived.items() if key not in options.optics})
+        for name in {reader.extinction, reader.names[reader.extinction]} & set(options.channels):
+            raise ConfigError(f"scene.channels: {name!r} is the extinction, which every model learns; expected others")
+        channels = measure_vdb_channels(frames, options.channels, context.progress)
         normalisation, measured = CaptureNormalisation.from_bounds(survey.box), survey.extents
         bounds = normalisation.to_scene(survey.box)
         auto_samples = choose_rays_per_pixel(train[0], survey.voxel * normalisation.scale)
@@ -281,7 +292,9 @@ def _prepare_vdb_scene(
         found = f"scene.lights={options.lights}: look {options.look} has no light"
         raise ConfigError(f"{found}; add scene.optics.light={{direction: [x, y, z], irradiance: [r, g, b]}}")
     lights = (options.lights, len(test))
-    capture = Capture(frames, reader, optics, *views, normalisation, bounds, *lights, measured=measured)
+    capture = Capture(
+        frames, reader, optics, *views, normalisation, bounds, *lights, measured=measured, channels=channels
+    )
     source: DataSource = "simulated" if options.vdb is None else "real"
     return _PreparedVdbScene(options, name, source, capture, range(len(train), len(train) + len(test)))
 

@@ -51,6 +51,10 @@ class StoredSize:
     size: int
 
 
+_UNSEEN_BITS = 8
+"""Bits of a column that the images do not show when the file is written. Other results, such as exported grids, may
+depend on it."""
+
 _SPIKY = 12.0  # A column whose error is this many times the usual one has outliers and gets twice the bits
 
 _LABEL = 16  # bits of a number that is not learned, such as a label, at every level
@@ -135,7 +139,10 @@ def fit_quantizers_to_error(model: Primitives, effects: Mapping[str, Tensor], er
         x = model.params[spec.name].reshape(model.count, spec.size)
         # An unknown effect counts as infinite: the column is stored as finely as possible.
         own = effects[spec.name].double().nan_to_num(nan=torch.inf, posinf=torch.inf)
-        steps = (12.0 * error / own).sqrt()  # infinite where nothing changes
+        steps = (12.0 * error / own).sqrt()
+        if model.count:  # channels, for example, change no image; infinite steps store columns of equal numbers
+            span = (x.amax(0) - x.amin(0)).double()
+            steps = torch.where((own == 0) & (span > 0), span / (2**_UNSEEN_BITS - 1), steps)
         if spec.name == "quats":
             turn = float((12.0 * 3.0 * error / own.sum()).sqrt())  # three of four components are stored
             found[spec.name] = RotationQuantizer(

@@ -95,7 +95,7 @@ def volume_values_at(
     named |= {CHANNEL + name: values for name, values in model.density.channels(active.own).items()}
     columns = [x for x in (isotropic, scattering) if x is not None]
     widths = [0 if x is None else x.shape[1] for x in (isotropic, scattering)]
-    columns += [factor.reshape(count, -1) for factor in named.values()]
+    columns += [factor if factor.dim() == 2 else factor[:, None] for factor in named.values()]
     weights = torch.cat(columns, 1) if columns else geometry.means.new_zeros(count, 0)
     form = model.density.lower(active.own, geometry, conditions)
     shapes = {name: factor.shape[1:] for name, factor in named.items()}

@@ -2,7 +2,7 @@
 (settings, tensors, count, lib) => {
   const own = (TIME_HARMONICS)(settings, tensors, count, lib), { channels, typical, octaves, share, anisotropy } = settings;
   const { scattered } = tensors, rest = { base: new Float64Array(channels) }, weight = new Float64Array(octaves);
-  const shadow = { where: "primitive", light: ({ light }) => light, size: 48, layers: 16, fade: 1 / 16, before: 0.5 };
+  const shadow = { where: "primitive", light: ({ light }) => light, size: 96, layers: 24, fade: 1 / 24, before: 0.5 };
   const away = (to, from) => {
     const d = to.map((x, a) => x - from[a]), length = Math.hypot(...d);
     return d.map(x => x / Math.max(length, 1e-30));

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 import torch
 
+from neuprim.cli import main
 from neuprim.config import RunConfig, compose
+from neuprim.core.checkpoint import load_model_checkpoint
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import VdbGrid, read_grid, vdb_scale_transform, write_vdb
 from neuprim.core.model.primitives import GEOMETRY_SPECS, Primitives
@@ -120,6 +122,12 @@ def test_a_run_exports_its_channels_with_errors(files: Path, tmp_path: Path) -> 
         assert np.sqrt(np.square(wrong).mean()) < 0.15 * np.abs(truth).max()
     assert any(note.startswith("channels heat, wind:") for note in report.notes)
     assert open_run(out).model.density.settings()["channels"] == [["heat", 830.0, 1], ["wind", 79.5, 3]]
+    stored = open_run(out)
+    assert main(["compress", str(out), "--seconds", "0"]) == 0
+    small = load_model_checkpoint(out / "model.neuprim", stored.task)[0]
+    for name in ("channel_heat", "channel_wind"):  # in another order
+        before, after = (model.params[name].sort(0).values for model in (stored.model, small))
+        assert float((after - before).abs().max()) < 0.01 * float(before.max() - before.min())
     with pytest.raises(ConfigError, match="name=heat: the model has a channel of this name"):
         export_run(out, "vdb", tmp_path / "again", ["name=heat"])
 

@@ -77,6 +77,7 @@ TABLES: dict[str, tuple[str, str, Callable[[Any], object]]] = {
     "webpage": ("docs/results/performance.md", "webpage", lambda s: s.page_table(record_of(s)["runs"])),
     "webpage-prepare": ("docs/results/performance.md", "webpage", lambda s: s.prepare_table(record_of(s)["prepare"])),
     "lit volumes": ("docs/results/dynamic.md", "lit_volumes", lambda s: s.table(record_of(s))),
+    "exported grids": ("docs/results/dynamic.md", "exported_grids", lambda s: s.table(record_of(s))),
     "sparse volumes": ("docs/results/dynamic.md", "sparse_volumes", lambda s: s.document(record_of(s))),
     "multiple scattering": ("docs/results/dynamic.md", "multiple_scattering", lambda s: s.table(record_of(s))),
     "capture": ("docs/results/relighting.md", "capture", lambda s: s.tables(record_of(s))),

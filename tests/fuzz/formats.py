@@ -244,7 +244,7 @@ def _voxels(folder: Path) -> None:
 def _read_voxels(folder: Path) -> None:
     from neuprim.tasks.dynamic.volume.capture_voxels import MediumVoxels
 
-    MediumVoxels.read(folder / "a.npz").values_at_cells(np.zeros((1, 3), np.int64))
+    MediumVoxels.read(folder / "a.npz").find_cells(np.zeros((1, 3), np.int64))
 
 
 # ---------------------------------------------------------------- cameras

@@ -15,7 +15,7 @@ from neuprim.cli import main
 from neuprim.config import RunConfig, compose
 from neuprim.core.checkpoint import load_model_checkpoint
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.io.vdb import VdbGrid, read_grid, vdb_scale_transform, write_vdb
+from neuprim.core.io.vdb import VdbGrid, VdbTiles, read_grid, vdb_scale_transform, write_vdb
 from neuprim.core.model.primitives import GEOMETRY_SPECS, Primitives
 from neuprim.core.volumes.points import channel_values_at
 from neuprim.runs.export import export_run
@@ -136,6 +136,10 @@ REFUSED: list[tuple[Any, str]] = [
     (["hest"], "scene.channels=hest: no frame has such a grid; did you mean 'heat'"),
     (["both"], "grid 'both' has 3 numbers per voxel; expected 1, as in earlier frames"),
     (["still"], "scene.channels=still: the grid is 0 in all frames"),
+    (
+        ["huge"],
+        ".vdb: grid 'huge' has 2146689 blocks of voxels that are not empty, which take 6259745124 bytes; at most",
+    ),
     (["density"], "scene.channels: 'density' is the extinction, which every model learns; expected others"),
     (["../heat"], "expected a list, each the name of a grid, of letters, digits and underscores"),
 ]
@@ -147,8 +151,14 @@ def test_channels_that_cannot_be_learned_are_refused(names: list[str], message: 
     for frame, shape in enumerate([(8, 8, 8), (8, 8, 8, 3)]):
         both = VdbGrid.from_dense("both", np.ones(shape, np.float32), transform=vdb_scale_transform(VOXEL))
         write_vdb(tmp_path / f"hot_{frame}.vdb", [*blob(8.0, ("density",)), heat(), still, both])
+        corners = 128 * np.stack(np.meshgrid(*(np.arange(8),) * 3), -1).reshape(-1, 3).astype(np.int32)
+        tiles = VdbTiles(corners, np.full(512, 128, np.int32), np.ones(512, np.float32), np.ones(512, bool))
+        huge = replace(still, name="huge", tiles=tiles)
+        write_vdb(tmp_path / f"hot_{frame}.vdb", [*blob(8.0, ("density",)), heat(), still, both, huge])
     with pytest.raises((ConfigError, DataError)) as caught:
-        dataset(tmp_path, tmp_path, channels=names)
+        data = dataset(tmp_path, tmp_path, channels=names)
+        assert data.points is not None
+        data.points.draw(8, torch.Generator().manual_seed(0))
     assert message in str(caught.value)
 
 

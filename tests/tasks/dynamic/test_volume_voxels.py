@@ -16,7 +16,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import write_vdb
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import fit, prepare_training
-from neuprim.tasks.dynamic.volume.capture_voxels import FrameVoxels, MediumVoxels
+from neuprim.tasks.dynamic.volume.capture_voxels import FrameVoxels, MediumVoxels, take_voxel_rows
 from neuprim.tasks.dynamic.volume.lit_medium import light_medium
 from tests.tasks.dynamic.sequences import VOXEL, dataset, empty_frame, recorded, write_blobs
 
@@ -173,7 +173,7 @@ def test_values_at_indices_are_those_of_the_grid() -> None:
     voxels = MediumVoxels(index, values.reshape(-1, 4)[index], (5, 4, 6), np.eye(4))
     cells = np.stack(np.meshgrid(*(np.arange(-2, n + 2) for n in (5, 4, 6)), indexing="ij"), -1).reshape(-1, 3)
     padded = np.pad(values, ((2, 2), (2, 2), (2, 2), (0, 0)))
-    assert np.array_equal(voxels.values_at_cells(cells), padded.reshape(-1, 4))
+    assert np.array_equal(take_voxel_rows(voxels.values, voxels.find_cells(cells)), padded.reshape(-1, 4))
 
 
 # ---------------------------------------------------------------- what is learned

@@ -144,7 +144,10 @@ class Capture:
         stored = {grid.name for grid in read_header(frame.path).grids}
         found = {name: np.zeros((len(points), width), np.float32) for name, (_, width) in self.channels.items()}
         for grid in read_grids(frame.path, [name for name in self.channels if name in stored]):
-            found[grid.name] = sample_vdb_grid(grid, world)
+            try:
+                found[grid.name] = sample_vdb_grid(grid, world)
+            except DataError as error:
+                raise DataError(f"{frame.path}: {error}") from error
         return found
 
     def placement(self) -> DensityGridPlacement:

@@ -18,7 +18,7 @@ from scipy import ndimage
 from neuprim.core.compute.kernels import inline, kernel
 from neuprim.core.compute.threads import parallel_for
 from neuprim.core.errors import DataError
-from neuprim.core.io.vdb import VdbGrid
+from neuprim.core.io.vdb import DENSE_LIMIT, VdbGrid
 
 _NEGLIGIBLE = 1e-7  # optical depth across a cell, and share of the strongest source, below which a voxel is empty
 
@@ -271,13 +271,18 @@ def grid_boxes(grid: VdbGrid) -> np.ndarray:
 def read_bricks(grid: VdbGrid, first: np.ndarray, layout: Bricks) -> np.ndarray:
     """Return (B, 9, 9, 9) float32, or (B, 9, 9, 9, 3): the values of a grid in the bricks of a layout.
 
-    ``first`` is the index, in the grid, of the layout's first voxel, a multiple of 8 along each axis.
+    ``first`` is the index, in the grid, of the layout's first voxel, a multiple of 8 along each axis. Raises DataError
+    if the result would be larger than :data:`~neuprim.core.io.vdb.DENSE_LIMIT`.
     """
     leaves = np.full(layout.table.shape, -1, np.int32)  # number of the leaf of the grid, or -1
     where = (grid.origins.astype(np.int64) - first) // EDGE
     inside = ((where >= 0) & (where < leaves.shape)).all(1)
     leaves[tuple(where[inside].T)] = np.flatnonzero(inside)
     numbers = leaves[layout.table >= 0]
+    size = len(numbers) * math.prod(layout.block) * 4 * grid.channels
+    if size > DENSE_LIMIT:
+        problem = f"{len(numbers)} blocks of voxels that are not empty, which take {size} bytes"
+        raise DataError(f"grid {grid.name!r} has {problem}; at most {DENSE_LIMIT} are allowed")
     used = np.flatnonzero(numbers >= 0)
     found = np.zeros((len(numbers), *layout.block, *grid.values.shape[4:]), np.float32)
     layout.without_shared(found)[used] = grid.values[numbers[used]]

@@ -55,8 +55,8 @@ OPTIONS = {
     "voxel_size": (None, "edge of a voxel in world units, instead of grid"),
     "units": ("auto", "source, world or scene; auto: source where the model was fitted to .vdb files, else world"),
     "threshold": (None, "values below it are not stored (default: an optical depth of 0.001 along the box)"),
-    "half": (False, "16-bit floats"),
-    "name": ("density", "name of the grid"),
+    "half": (None, "16-bit floats, true or false (default: as in the source)"),
+    "name": (None, "name of the grid (default: the source's name in units=source, else density)"),
     "velocity": (False, "also write the grid vel: velocities of the primitives, in world units per frame"),
     "emission": (False, "also write the grid emission: extinction times emitted colour, linear RGB"),
     "albedo": (False, "also write the grid albedo, of models trained with scene.lights=4"),
@@ -97,7 +97,10 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
     box = np.stack([v.numpy() for v in find_export_box(job, [*every, *(f.conditions for f in frames)])])
     threshold = job.number("threshold", 0.0, 1e9)
     threshold = 1e-3 / float((box[1] - box[0]).max()) * factor if threshold is None else threshold
-    name = str(job.options["name"])
+    name = placement.grid if placement is not None and units == "source" else "density"
+    name = name if job.options["name"] is None else str(job.options["name"])
+    half = source is not None and source.half and units == "source"
+    half = half if job.options["half"] is None else job.flag("half")
     own = job.number("grid") is None and job.number("voxel_size") is None and source is not None
     origin = np.zeros(3) if placement else job.run.world.world_from_scene[:3, 3].numpy()
     fallback = _export_voxel_transform(job, box, scene_from_world, origin)
@@ -125,11 +128,11 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
         others = []
         if look is not None or channels:  # flames glow where the exported extinction may be 0
             lit = grid if sampler.model is whole.model else whole.sample_grid(frame.conditions, transform)
-            lit = replace(lit, half=job.flag("half"))
+            lit = replace(lit, half=half)
             others += [] if look is None else look.sample_grids(job.run.model, frame.conditions, lit)
             others += sample_channels(job.run.model, frame.conditions, lit, scene_from_world, job.run.settings.threads)
         more = {f"neuprim_{key}": float(v) for key, v in frame.conditions.items() if v.numel() == 1}
-        grid = replace(grid, half=job.flag("half"), metadata={**metadata, **more})
+        grid = replace(grid, half=half, metadata={**metadata, **more})
         if moving is not None:
             others.append(moving.sample_grid(sampler.model, frame.conditions, grid))
         write_vdb(path, [grid, *others])

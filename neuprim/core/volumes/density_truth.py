@@ -187,6 +187,7 @@ class DensityGridSource(DensityTruth):
     """Base class of ground truth in voxel files, read one frame at a time."""
 
     placement: DensityGridPlacement  # position and units of the files; has the same frames as the ground truth
+    half = False  # whether the files store the absorbing grid as 16-bit floats
 
     @abstractmethod
     def grid_transform(self, frame: int) -> np.ndarray | None:

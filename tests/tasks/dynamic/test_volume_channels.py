@@ -49,7 +49,7 @@ def wind() -> VdbGrid:
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("hot")
     for number in range(4):
-        grids = blob(8.0 + number, ("density",))
+        grids = blob(8.0 + number, ("smoke",))
         write_vdb(folder / f"hot_{number}.vdb", [*grids, *([] if number == WITHOUT else [heat(), wind()])])
     return folder
 
@@ -109,7 +109,7 @@ def test_a_run_exports_its_channels_with_errors(files: Path, tmp_path: Path) -> 
     metrics = json.loads((out / "metrics.json").read_text())
     assert len(metrics["heat_frames"]) == 3  # it is constant in the frame without the grid
     for number, path in enumerate(report.files):
-        density, found, blown = (read_grid(path, name) for name in ("density", "heat", "wind"))
+        density, found, blown = (read_grid(path, name) for name in ("smoke", "heat", "wind"))
         assert blown.channels == 3 and np.array_equal(blown.masks, density.masks)
         assert np.array_equal(found.masks, density.masks) and np.array_equal(found.origins, density.origins)
         if number == WITHOUT:

@@ -171,6 +171,7 @@ def test_exported_density_is_the_files_own(files: Path, tmp_path: Path) -> None:
             grid = read_grid(path, "density")
             box = grid.world_bounds()
             half = np.array(grid.voxel_size) / 2
+            assert grid.half is source.half is True
             assert grid.range is not None and grid.range[1] <= source.range[1] * 1.001
             assert box is not None and (box[0] >= world[0] - half - 1e-6).all()
             assert (box[1] <= world[1] + half + 1e-6).all()

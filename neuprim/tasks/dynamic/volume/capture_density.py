@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.vdb import VdbFrame, list_vdb_files
+from neuprim.core.io.vdb import VdbFrame, list_vdb_files, read_header
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes.density_grid import voxels_in_box
 from neuprim.core.volumes.density_truth import (
@@ -72,6 +72,8 @@ class CaptureDensity(DensityGridSource):
             numbers = re.findall(r"[0-9]{1,18}", path.stem)  # the last one counts, as in a folder
             files = [VdbFrame(int(numbers[-1]) if numbers else -1, path)]
         self._files = files
+        headers = (grid for file in files[:1] for grid in read_header(file.path).grids)
+        self.half = any(grid.name == self.placement.grid and grid.half for grid in headers)
         self._cached: tuple[int, Medium] | None = None
         timed = [{"time": torch.tensor(capture.time(f))} if first <= f.number <= last else {} for f in files]
         self.frames = [TruthFrame(file.path.name, times) for file, times in zip(files, timed, strict=True)]

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.data import PointSamples, ViewSet
+from neuprim.core.model.fields import CHANNEL
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.output import Contributions
 from neuprim.core.task import Loss, Supervision
@@ -38,6 +39,9 @@ _COMPONENT_WEIGHT = 0.1
 """Weight of the loss of the extinction's components, which are the parts of the extinction from single source grids.
 This loss trains the share of each component in a primitive. Shares are learned equally fast with any weight; this
 weight is so small that the loss hardly moves primitives."""
+
+
+_FAINT = 0.02  # typical extinctions below which the error of a channel at a point counts less
 
 
 def photometric_reference(rendered: Tensor, truth: Tensor, ssim_weight: float) -> tuple[Tensor, dict[str, Tensor]]:
@@ -180,7 +184,8 @@ def point_loss(model: Primitives, samples: PointSamples, settings: TrainSettings
     The loss is a weighted sum of mean squared errors, each error divided by a scale from ``samples``. With
     ``train.supervision=both``, squared errors of the extinction are also divided by 1 + true extinction / scale. This
     lowers the weight of dense matter, because images do not show its inside. The weights are 1 for the extinction, 0.1
-    for each extinction component, and ``train.voxel_colour`` for the source radiance and for the scattered radiance.
+    for each extinction component and channel, and ``train.voxel_colour`` for the source radiance and for the scattered
+    radiance. The error of a channel is that of its mean over primitives, weighted by their extinctions.
     """
     colour = samples.source is not None and settings.voxel_colour > 0
     found = volume_values_at(model, samples.conditions, samples.points, colour, threads)
@@ -201,7 +206,15 @@ def point_loss(model: Primitives, samples: PointSamples, settings: TrainSettings
         loss = loss + settings.voxel_colour * light.square().mean()
     for name, (value, scale) in samples.components.items():
         if name in found.components:
-            part = (found.components[name] - device.copy_to_device(value, where)) * (1 / scale)
+            known, own = device.copy_to_device(value, where), found.components[name]
+            if name.startswith(CHANNEL):  # with the model's own sigma, so that wrong extinction is no error of channels
+                true, sigma_found = sigma[:, None], found.sigma.detach()[:, None]
+                inside = true > 0
+                wanted = torch.where(inside, sigma_found * known / torch.where(inside, true, 1.0), own.detach())
+                per_sigma = 1 / (sigma_found + _FAINT * samples.sigma_scale)
+                part = (own - wanted) * per_sigma * (samples.sigma_scale / scale)
+            else:
+                part = (own - known) * (1 / scale)
             loss = loss + _COMPONENT_WEIGHT * part.square().mean()
     return PointLossResult(loss, parts, samples, found.rows, found.request_shares(wrong.detach().abs()))
 

@@ -163,7 +163,7 @@ class TimeDensity(DensityField):
             specs.append(ParameterSpec("chunk", (1,), 0.0, _zero_time_parameters(1)))
         specs += [ParameterSpec(_SHARE + name, (1,), 0.3, _zero_time_parameters(1)) for name in self.named]
         for name, (_, width) in self.sizes.items():
-            specs.append(ParameterSpec(CHANNEL + name, (width,), 3e-2, _zero_time_parameters(width)))
+            specs.append(ParameterSpec(CHANNEL + name, (width,), 1e-1, _zero_time_parameters(width)))
         return specs
 
     def components(self, params: Params) -> dict[str, Tensor]:

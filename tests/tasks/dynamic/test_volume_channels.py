@@ -14,10 +14,13 @@ import torch
 from neuprim.cli import main
 from neuprim.config import RunConfig, compose
 from neuprim.core.checkpoint import load_model_checkpoint
+from neuprim.core.data import PointSamples
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import VdbGrid, VdbTiles, read_grid, vdb_scale_transform, write_vdb
 from neuprim.core.model.primitives import GEOMETRY_SPECS, Primitives
-from neuprim.core.volumes.points import channel_values_at
+from neuprim.core.train.losses import point_loss
+from neuprim.core.train.settings import TrainSettings
+from neuprim.core.volumes.points import channel_values_at, volume_values_at
 from neuprim.runs.export import export_run
 from neuprim.runs.open import open_run
 from neuprim.runs.run import run
@@ -100,6 +103,29 @@ def test_the_value_is_the_mean_over_primitives_weighted_by_extinction() -> None:
     for name, (size, _) in density.sizes.items():
         true = (sigma @ params[f"channel_{name}"]) * size / sigma.sum(1, keepdim=True).clamp_min(1e-300)
         assert torch.allclose(found[name].double(), true, rtol=1e-4, atol=1e-4 * size)
+
+
+def test_wrong_extinction_is_no_error_of_a_channel() -> None:
+    generator = torch.Generator().manual_seed(2)
+    density, colour = TimeDensity(0, "none", channels=[("heat", 400.0, 1)]), TimeHarmonics(0)
+    specs = [*GEOMETRY_SPECS, *density.parameters(), *colour.parameters()]
+    params = {spec.name: torch.rand((40, *spec.shape), generator=generator) for spec in specs}
+    params |= {"log_scales": params["log_scales"] - 1.5}
+    points, sigma = torch.rand((200, 3), generator=generator), 3 * torch.rand(200, generator=generator)
+    sigma[:20] = 0
+    plain = PointSamples("frame", {"time": torch.tensor(0.5)}, points, sigma, None, 2.0)
+    hot = replace(plain, components={"channel_heat": (200 * sigma[:, None], 300.0)})  # 200 everywhere
+
+    def loss(share: float, samples: PointSamples) -> float:
+        model = Primitives(density, colour, {**params, "channel_heat": torch.full((40, 1), share)})
+        return float(point_loss(model, samples, TrainSettings()).loss)
+
+    model = Primitives(density, colour, params)
+    found = volume_values_at(model, plain.conditions, points, colour=False).sigma.double()
+    assert abs(loss(0.5, hot) - loss(0.5, plain)) < 1e-6 < loss(0.5, plain)
+    error = 0.1 * 400 * found / (found + 0.02 * 2.0) * (2.0 / 300.0) * (sigma > 0)
+    added = 0.1 * float(error.square().mean())
+    assert loss(0.6, hot) - loss(0.6, plain) == pytest.approx(added, rel=1e-3) and added > 1e-3
 
 
 @pytest.mark.filterwarnings("ignore::neuprim.core.errors.NeuprimWarning")

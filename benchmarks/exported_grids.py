@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from shared.arguments import make_parser
+from shared.arguments import make_parser, require_folders
 from shared.tables import RESULTS, Record, Table, publish
 
 from neuprim.config import compose
@@ -81,9 +81,8 @@ def add_velocity(source: Path, frames: Iterator[Frame], target: Path) -> Path:
     target.mkdir()
     for frame, (_, velocity) in zip(list_vdb_files(source).frames, frames, strict=True):
         grids = list(read_grids(frame.path))
-        write_vdb(
-            target / frame.path.name, [*grids, VdbGrid.from_dense("velocity", velocity, transform=grids[0].transform)]
-        )
+        moving = VdbGrid.from_dense("velocity", velocity, transform=grids[0].transform)
+        write_vdb(target / frame.path.name, [*grids, moving])
     return target
 
 
@@ -106,34 +105,23 @@ def train(scene: str, words: list[str], steps: int, folder: Path) -> tuple[Path,
     return run(compose(words)), time.process_time() - start
 
 
-def correlation(exported: np.ndarray, source: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
-    """Return Pearson's correlation of (M, C) values, and the slope of ``exported`` over ``source``."""
-    w = weights[:, None] / weights.sum()
-    a, b = exported - (w * exported).sum(0), source - (w * source).sum(0)
-    aa, bb, ab = ((w * x * y).sum() for x, y in ((a, a), (b, b), (a, b)))
-    return float(ab / np.sqrt(aa * bb)), float(ab / bb)
+def correlation(exported: np.ndarray, source: np.ndarray) -> float:
+    """Return Pearson's correlation of (M, C) values."""
+    a, b = exported - exported.mean(0), source - source.mean(0)
+    return float((a * b).sum() / np.sqrt((a * a).sum() * (b * b).sum()))
 
 
 def compare(files: tuple[Path, ...], frames: Iterator[Frame]) -> Record:
     """Compare exported files with the frames of the source."""
     parts: list[tuple[np.ndarray, ...]] = []
-    matter = 0
     for file, (density, velocity) in zip(files, frames, strict=True):
         box: Any = ((0, 0, 0), density.shape)
         found, moving = read_grid(file, "density").to_dense(box), read_grid(file, "vel").to_dense(box)
-        inside = (density > 2e-3 * density.max()) & (density > 0)
-        matter += int(inside.sum())
-        inside &= found > 0
-        parts.append((moving[inside], velocity[inside], density[inside]))
-    exported, source, weights = (np.concatenate(x).astype(np.float64) for x in zip(*parts, strict=True))
-    whole, slope = correlation(exported, source, np.ones_like(weights))
-    heavy, _ = correlation(exported, source, weights)
-    axes = [correlation(exported[:, [i]], source[:, [i]], np.ones_like(weights))[0] for i in range(3)]
-    rms = [float(np.sqrt(np.square(x).mean())) for x in (exported, source)]
-    return {
-        "voxels": len(source), "share_of_matter": len(source) / matter, "correlation": whole, "slope": slope,
-        "correlation_weighted": heavy, "correlation_xyz": axes, "rms_exported": rms[0], "rms_source": rms[1],
-    }  # fmt: skip
+        inside = (density > 2e-3 * density.max()) & (density > 0) & (found > 0)
+        parts.append((moving[inside], velocity[inside]))
+    exported, source = (np.concatenate(x).astype(np.float64) for x in zip(*parts, strict=True))
+    axes = [correlation(exported[:, [i]], source[:, [i]]) for i in range(3)]
+    return {"voxels": len(source), "correlation": correlation(exported, source), "correlation_xyz": axes}
 
 
 def blur(directory: Path, number: int, folder: Path) -> Record:
@@ -159,10 +147,8 @@ def measure(scene: str, folders: Mapping[str, Path | None], steps: int) -> Recor
         folder = Path(name)
         if scene == "smoke_fire":
             simulated = simulate_smoke("smoke_fire", FRAMES, RESOLUTION, 0, folder, lambda text, share: None)
-            files, channels = (
-                add_velocity(simulated, simulate(), folder / "files"),
-                ["temperature", "flames", "velocity"],
-            )
+            files = add_velocity(simulated, simulate(), folder / "files")
+            channels = ["temperature", "flames", "velocity"]
             words, frames = ["scene.look=smoke_fire"], simulate()
         elif scene == "mantaflow":
             source = folders[scene]
@@ -214,9 +200,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=8000)
     args = parser.parse_args()
     folders = {"mantaflow": args.mantaflow, "embergen": args.embergen}
-    for scene, folder in folders.items():
-        if scene in args.scenes and folder is None and not args.only_print:
-            parser.error(f"--{scene}: wants the folder of its data; or leave it out of --scenes")
+    if not args.only_print:
+        require_folders(parser, args, args.scenes)
 
     def run_scenes() -> Record:
         torch.set_num_threads(1)

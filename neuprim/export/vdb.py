@@ -1,6 +1,6 @@
 """Export format ``vdb``: the density as an OpenVDB fog volume, one file per frame of a dynamic model; lossy (sampled).
 
-Grid ``density`` is the sum of the primitives' densities at the voxels' centres, each clamped at 0 from below. Values
+The density grid is the sum of the primitives' densities at the voxels' centres, each clamped at 0 from below. Values
 below ``threshold`` are not stored (background 0, inactive).
 
 A model that was fitted to .vdb files is written on the voxels and in the units of these source files. Values are
@@ -14,7 +14,7 @@ Units (metadata ``neuprim_units``):
 * ``world``: extinction per world unit, which a volume shader multiplies by a length
 * ``scene``: extinction per scene unit, i.e. sigma
 
-The channels of the model, e.g. the temperature (``scene.channels``), are scalar grids of their own. ``velocity=true``,
+The channels of the model, e.g. the temperature (``scene.channels``), are grids of their own. ``velocity=true``,
 ``emission=true`` and ``albedo=true`` add vector grids (:mod:`neuprim.export.vector_grids`), and ``usd=true`` adds a
 stage of the files (:mod:`neuprim.export.usd_volume`).
 """

@@ -64,12 +64,10 @@ def _tunable_time_settings(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...
 
 
 def _build_time_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
-    points = dataset.points
-    grids: dict[str, Any] = (
-        {}
-        if points is None
-        else {"components": points.components, "channels": [(n, *size) for n, size in points.channels.items()]}
-    )
+    grids: dict[str, Any] = {}
+    if dataset.points is not None:
+        grids["components"] = dataset.points.components
+        grids["channels"] = [(name, *size) for name, size in dataset.points.channels.items()]
     density = TimeDensity(model["neurons"], **model["density"], **grids)
     settings = (model["sh_degree"], dataset.channels, model["sh_every"])
     if "light" in dataset.train.view(0).conditions:

@@ -176,7 +176,6 @@ def test_channels_that_cannot_be_learned_are_refused(names: list[str], message: 
     still = VdbGrid.from_dense("still", np.zeros((8, 8, 8), np.float32), transform=vdb_scale_transform(VOXEL))
     for frame, shape in enumerate([(8, 8, 8), (8, 8, 8, 3)]):
         both = VdbGrid.from_dense("both", np.ones(shape, np.float32), transform=vdb_scale_transform(VOXEL))
-        write_vdb(tmp_path / f"hot_{frame}.vdb", [*blob(8.0, ("density",)), heat(), still, both])
         corners = 128 * np.stack(np.meshgrid(*(np.arange(8),) * 3), -1).reshape(-1, 3).astype(np.int32)
         tiles = VdbTiles(corners, np.full(512, 128, np.int32), np.ones(512, np.float32), np.ones(512, bool))
         huge = replace(still, name="huge", tiles=tiles)
@@ -193,9 +192,11 @@ def test_channels_need_voxels(files: Path, tmp_path: Path) -> None:
         run(composed(files, tmp_path / "run", "train.supervision=images"))
 
 
-@pytest.mark.parametrize(
-    "channels", [["heat"], [["a b", 1.0]], [["heat", 0.0]], [["heat", "x"]], [["heat", 1.0]] * 2, 7]
-)
+DAMAGED: list[Any] = [["heat"], [["heat", 1.0]], [["a b", 1.0, 1]], [["heat", 0.0, 1]], [["heat", "x", 1]], 7,
+    [["heat", 1.0, 2]], [["heat", float("nan"), 1]], [["heat", 1.0, 1]] * 2]  # fmt: skip
+
+
+@pytest.mark.parametrize("channels", DAMAGED)
 def test_damaged_channels_of_a_model_are_refused(channels: Any) -> None:
     with pytest.raises(ValueError, match="expected a name, a number above 0, and 1 or 3, for each"):
         TimeDensity(0, channels=channels)

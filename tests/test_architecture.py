@@ -56,8 +56,9 @@ ROOMS: dict[str, set[str]] = {
     "conformance": {"config", "core", "plugins"},
     "runs": {"config", "core", "inspect", "plugins", "report", "version", "webpage"},
     "search": {"config", "core", "plugins", "report", "runs", "version"},
+    "blender": {"core", "version"},
     "viewer": {"config", "core", "inspect", "plugins", "runs", "webpage"},
-    "cli": {"config", "core", "inspect", "plugins", "runs", "search", "version", "viewer"},
+    "cli": {"blender", "config", "core", "inspect", "plugins", "runs", "search", "version", "viewer"},
 }
 """Room of the package -> those it may import from."""
 

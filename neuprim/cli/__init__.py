@@ -22,7 +22,8 @@ __all__ = ["COMMANDS", "main"]
 
 _MODULES = ("run", "measure", "model", "view", "install")
 _ORDER = (
-    "run truth eval render tradeoff export compress prune import inspect view vdb tasks new-task bench doctor".split()
+    *("run", "truth", "eval", "render", "tradeoff", "export", "compress", "prune", "import", "inspect", "view", "vdb"),
+    *("tasks", "new-task", "blender-addon", "bench", "doctor"),
 )
 _FOUND = {
     value.name: value

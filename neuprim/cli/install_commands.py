@@ -1,4 +1,4 @@
-"""``neuprim tasks``, ``new-task`` and ``doctor``: list what is installed, start a plugin, check the installation."""
+"""``neuprim tasks``, ``new-task``, ``blender-addon`` and ``doctor``: plugins, add-on for Blender, installation."""
 
 from __future__ import annotations
 
@@ -119,6 +119,19 @@ def _new_task_command(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _add_blender_addon_arguments(parser: argparse.ArgumentParser) -> None:
+    out = "where to write (default: neuprim-blender.zip)"
+    parser.add_argument("--out", type=Path, metavar="FILE", default=Path("neuprim-blender.zip"), help=out)
+
+
+def _blender_addon_command(arguments: argparse.Namespace) -> int:
+    from neuprim.blender import write_blender_addon
+
+    write_blender_addon(arguments.out)
+    print(arguments.out)
+    return 0
+
+
 TASKS_COMMAND = Command(
     "tasks", "list tasks, scenes, presets and other plugins, and the packages they come from", _tasks_command
 )
@@ -127,6 +140,12 @@ NEW_TASK_COMMAND = Command(
     "create a small working package with a task of your own (guide: docs/plugins.md)",
     _new_task_command,
     _add_new_task_arguments,
+)
+BLENDER_ADDON_COMMAND = Command(
+    "blender-addon",
+    "write the add-on for Blender, which uses this installation (guide: docs/pipeline.md)",
+    _blender_addon_command,
+    _add_blender_addon_arguments,
 )
 
 

@@ -393,7 +393,7 @@ def test_settings_are_anywhere_on_the_line(tmp_path: Path, monkeypatch: pytest.M
 
 def test_every_command_that_writes_has_the_same_option() -> None:
     writing = {name for name, command in COMMANDS.items() if "--out" in command.build_parser()._option_string_actions}
-    assert writing == {*"run render tradeoff export compress prune import inspect new-task bench".split()}
+    assert writing == {*"run render tradeoff export compress prune import inspect new-task blender-addon bench".split()}
 
 
 def test_help_is_light_and_the_module_runs() -> None:

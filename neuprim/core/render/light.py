@@ -69,6 +69,7 @@ diameters. Surfaces made of ellipsoids are bumpy: with shorter distances, the bu
 distances, shadows detach from their casters. A point at the depth of the depth image keeps all of its light."""
 
 _FAR = 1e3  # scene radii; beyond, all rays are parallel, and float32 depths lose all digits
+_OUTSIDE = 1 / 0.94  # scene radii; one camera sees everything from a light that is farther away
 _CHUNK = 1024  # points per unit of work
 
 
@@ -145,16 +146,17 @@ def light_visibility(
     fade is the distance over which light fades at a slab; for ``before`` see :class:`Visibility`. With ``before`` = 0,
     V is exactly 1 where nothing lies in front, and 1 - A well behind an object of opacity A. A single slab would be an
     ordinary shadow map. The depth of such a map is one mean per pixel, between a translucent object and the floor below
-    it. Inverse depths, weighted by opacity, are interpolated bilinearly. The interpolation is exact on planes, so that
-    a lit floor does not shadow itself at grazing light. V has no gradient.
+    it.
 
-    The light's camera looks at the middle of all centres. The camera sees all centres, unless the light is among the
-    primitives or close to them. Points behind the light count as lit. The depth images are rendered with the backend
-    and threads of the frame's ``settings``.
+    The light's camera looks at the middle of all centres and sees all of them. If the light is among the primitives or
+    close to them, six cameras look along the axes of the scene instead, and each has maps of its own. Inverse depths,
+    weighted by opacity, are interpolated bilinearly. The interpolation is exact on planes, so that a lit floor does not
+    shadow itself at grazing light. V has no gradient. The depth images are rendered with the backend and threads of the
+    frame's ``settings``.
     """
-    if not geometry.count:
-        return lambda points, fade, more=None, before=0.0: torch.ones(len(points), device=points.device)
     with torch.no_grad():
+        if not geometry.count:
+            return _see_everything
         means = geometry.means.detach().double()
         light = light.detach().double()
         middle = (means.amin(0) + means.amax(0)) / 2
@@ -163,23 +165,71 @@ def light_visibility(
         center, light = torch.tensor(place, dtype=torch.float64), light.cpu()
         radius = far_away + margin
         distance = float((light - center).norm())
-        if distance < 1e-9 * max(radius, 1e-30):
-            return lambda points, fade, more=None, before=0.0: torch.ones(len(points), device=points.device)
         if distance > _FAR * radius:
             light, distance = center + (light - center) * (_FAR * radius / distance), _FAR * radius
-        focal = 0.5 * size / math.tan(math.asin(min(radius / distance, 0.94)))
-        overhead = abs(float(light[2] - center[2])) >= 0.9 * distance
-        up = torch.tensor([0.0, 1.0, 0.0] if overhead else [0.0, 0.0, 1.0], dtype=torch.float64)
-        camera = Camera(look_at(light, center, up), focal, focal, size / 2, size / 2, size, size)
-        near = max(1e-4 * radius, distance - 1.5 * radius)
-        depths = means @ device.to_device_like(camera.viewmat[2, :3], means) + camera.viewmat[2, 3]
-        low, high = torch.stack([depths.min(), depths.max()]).tolist()
-        slabs = ((depths - low) * (layers / max(high - low, 1e-30))).ceil_().long().sub_(1).clamp_(0, layers - 1)
-        own = replace(settings, depth=True, near=near, samples=1)
-        opacities, distances = render_slabs(geometry, density, slabs, layers, camera, own)
+        own = replace(settings, depth=True, samples=1)
+        if distance > _OUTSIDE * radius:
+            overhead = abs(float(light[2] - center[2])) >= 0.9 * distance
+            up = torch.tensor([0.0, 1.0, 0.0] if overhead else [0.0, 0.0, 1.0], dtype=torch.float64)
+            focal = 0.5 * size / math.tan(math.asin(radius / distance))
+            view, near = look_at(light, center, up), max(1e-4 * radius, distance - 1.5 * radius)
+            return _draw_shadow_maps(geometry, density, layers, own, _square_camera(view, focal, size), near, radius)
+        axes = torch.cat([torch.eye(3, dtype=torch.float64), -torch.eye(3, dtype=torch.float64)])
+        extents, near, faces = geometry.scales.detach().amax(-1), 1e-4 * radius, []
+        for axis in axes:
+            # a little more than 90 degrees, so that a map has pixels on both sides of the edge to the next map
+            camera = _square_camera(look_at(light, light + axis, axis.roll(1)), 0.5 * size - 1, size)
+            ahead = (_camera_depths(means, camera) + extents > near).nonzero()[:, 0]
+            seen = geometry[ahead], density.primitive_rows(ahead)
+            face = _draw_shadow_maps(*seen, layers, own, camera, near, radius) if len(ahead) else _see_everything
+            faces.append(face)
+
+    def visibility(points: Tensor, fade: float, more: Tensor | None = None, before: float = 0.0) -> Tensor:
+        points = points.detach().double()
+        towards = points - device.to_device_like(light, points)
+        nearest = (towards @ device.to_device_like(axes, points).T).argmax(-1)
+        found = torch.ones(len(points), device=points.device)
+        for k, face in enumerate(faces):
+            rows = (nearest == k).nonzero()[:, 0]
+            found[rows] = face(points[rows], fade, None if more is None else more[rows], before)
+        return found
+
+    return visibility
+
+
+def _see_everything(points: Tensor, fade: float, more: Tensor | None = None, before: float = 0.0) -> Tensor:
+    return torch.ones(len(points), device=points.device)
+
+
+def _square_camera(view: Tensor, focal: float, size: int) -> Camera:
+    return Camera(view, focal, focal, size / 2, size / 2, size, size)
+
+
+def _camera_depths(means: Tensor, camera: Camera) -> Tensor:
+    """Return the (N,) float64 depths of the centres ``means``, float64, along the camera's axis."""
+    return means @ device.to_device_like(camera.viewmat[2, :3], means) + camera.viewmat[2, 3]
+
+
+def _draw_shadow_maps(
+    geometry: Geometry,
+    density: LoweredDensity,
+    layers: int,
+    settings: RenderSettings,
+    camera: Camera,
+    near: float,
+    radius: float,
+) -> Visibility:
+    """Render the shadow maps that a light's ``camera`` sees; see :func:`light_visibility`.
+
+    ``near`` is the smallest depth that the camera sees, ``radius`` that of the whole scene.
+    """
+    depths = _camera_depths(geometry.means.detach().double(), camera)
+    low, high = torch.stack([depths.min(), depths.max()]).tolist()
+    slabs = ((depths - low) * (layers / max(high - low, 1e-30))).ceil_().long().sub_(1).clamp_(0, layers - 1)
+    opacities, distances = render_slabs(geometry, density, slabs, layers, camera, replace(settings, near=near))
     view = camera.viewmat[:3].contiguous()
     maps = None
-    if device.on_numba(means, opacities):
+    if device.on_numba(depths, opacities):
         maps = interleave_shadow_maps(opacities.numpy(), distances.numpy(), near)
 
     def visibility(points: Tensor, fade: float, more: Tensor | None = None, before: float = 0.0) -> Tensor:
@@ -189,9 +239,9 @@ def light_visibility(
             fades += more
         if maps is None:
             place = device.to_device_like(view, points)
-            return sample_visibility(points, place, near, focal, opacities, distances, fades, before)
+            return sample_visibility(points, place, near, camera.fx, opacities, distances, fades, before)
         found = np.empty(len(points), np.float32)
-        inputs = (points.numpy(), view.numpy(), near, focal, maps, fades.numpy(), before, found)
+        inputs = (points.numpy(), view.numpy(), near, camera.fx, maps, fades.numpy(), before, found)
         chunk = chunk_size(len(found), _CHUNK, settings.threads)
         parallel_for(_visibility_kernel, len(found), chunk, settings.threads, *inputs)
         return torch.from_numpy(found)

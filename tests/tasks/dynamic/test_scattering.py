@@ -96,14 +96,29 @@ def exact_transmittance(model: Primitives, light: Tensor, steps: int = 400) -> T
     return (-depth).exp()
 
 
-def test_light_arrives_as_the_extinction_lets_it() -> None:
-    model = cloud()
-    for light in ([3e3, -2e3, 4e3], [0.0, 0.0, 1.5], [-1.2, 0.3, 0.1]):
-        found, exact = (f(model, torch.tensor(light)) for f in (transmittance, exact_transmittance))
-        assert exact.min() < 0.2 and exact.max() > 0.9
-        wrong = (found - exact).abs()
-        assert float(wrong.mean()) < 0.025 and float(wrong.max()) < 0.15, light
-        assert float(torch.corrcoef(torch.stack([found, exact]))[0, 1]) > 0.99
+@pytest.mark.parametrize(
+    "light, most",
+    [
+        ((3e3, -2e3, 4e3), 0.15),
+        ((0.0, 0.0, 1e4), 0.15),
+        ((1e6, 0.0, 0.0), 0.16),
+        ((0.0, 0.0, 1.5), 0.15),
+        ((-1.2, 0.3, 0.1), 0.15),
+        ((0.52, 0.0, 0.0), 0.15),  # at the edge of the cloud; the others are inside of it
+        ((0.2, 0.1, -0.1), 0.16),
+        ((1e-4, 0.0, 0.0), 0.3),  # amid all centres: some balls contain it
+        ((0.0, 0.0, 0.0), 0.3),
+    ],
+)
+def test_light_arrives_as_the_extinction_lets_it(
+    light: tuple[float, float, float], most: float, either_way: str
+) -> None:
+    model, place = cloud(), torch.tensor(light)
+    found, exact = (f(model, place) for f in (transmittance, exact_transmittance))
+    assert exact.min() < 0.2 and exact.max() > 0.7
+    wrong = (found - exact).abs()
+    assert float(wrong.mean()) < 0.025 and float(wrong.max()) < most
+    assert float(torch.corrcoef(torch.stack([found, exact]))[0, 1]) > 0.97
 
 
 @pytest.mark.parametrize(

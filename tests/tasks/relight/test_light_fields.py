@@ -195,6 +195,25 @@ def test_what_nothing_covers_is_lit_fully(light: tuple[float, float, float]) -> 
     assert int(clear.sum()) > 100 and float(found[clear].min()) > 0.999
 
 
+@pytest.mark.parametrize("light", [(0.0, 0.0, 0.0), (0.1, -0.05, 0.02)])
+def test_a_light_amid_things_casts_shadows_all_around(light: tuple[float, float, float], either_way: str) -> None:
+    """Balls along the axes, and along the diagonals, where three maps meet; nothing lies in other directions."""
+    place = torch.tensor(light)
+    units = torch.nn.functional.normalize(torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * 3), dim=-1)
+    covered = torch.tensor([int((unit != 0).sum()) in (1, 3) for unit in units])
+    clear = torch.tensor([int((unit != 0).sum()) == 2 for unit in units])
+    count = int(covered.sum())
+    assert count == 14
+    shape = torch.full((count, 3), math.log(0.2)), torch.tensor([[1.0, 0, 0, 0]] * count)
+    density = Cosine(
+        torch.zeros(count, 0, 3), torch.zeros(count, 0), torch.zeros(count, 0), torch.full((count, 1), 50.0)
+    )
+    visible = light_visibility(Geometry(place + units[covered], *shape), density, place, SETTINGS)
+    assert float(visible(place + 3.0 * units[covered], FADE).max()) < 0.02
+    assert float(visible(place + 0.5 * units[covered], FADE).min()) == 1.0
+    assert float(visible(place + 3.0 * units[clear], FADE).min()) > 0.999
+
+
 @pytest.mark.parametrize("distance", [1e3, 1e8, 1e18])
 def test_distant_lights_cast_the_shadows_of_near_ones(distance: float) -> None:
     geometry, density = slabs()

@@ -9,7 +9,7 @@ function framesOf(page, source) {
       if (data.kind === "ready") resolve(data);
       else if (data.kind === "fault") reject(new Error(data.text));
       else if (data.kind === "light") { // what the light sees is drawn here, then the frame goes on there
-        const maps = paint.shadowMaps(data.camera, data.rows, data.phases, data.ends);
+        const maps = paint.shadowMaps(data);
         const copies = maps.map(map => map.buffer);
         worker.postMessage({ ...data, kind: "maps", camera: data.asked, maps }, [data.rows.buffer, data.phases.buffer, ...copies]);
       } else if (data.kind === "frame") {

@@ -142,28 +142,31 @@ function painter(canvas, page, made) {
     return values;
   }
 
-  // Depth images out of the light, slab by slab: Float32Array (size, size, 4) each.
-  function shadowMaps(camera, rows, phases, ends) {
+  // Depth images out of the light, slab by slab: Float32Array (size, size, 4) each. place: the number of the light's camera, and how many there are.
+  function shadowMaps({ camera, rows, phases, ends, place: [number, cameras] }) {
     upload(rows, phases, ends[ends.length - 1]);
     const found = ends.map((end, k) => {
       splats("light", SPARE, camera, k ? ends[k - 1] : 0, end, "DEPTH");
       return read(camera.width, camera.height, targets.light.frame);
     });
     if (made.shadow.where === "pixel") {
-      if (maps) gl.deleteTexture(maps);
-      maps = texture(MAPS, gl.RGBA32F, camera.width, camera.height, found.length);
-      found.forEach((map, k) => gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, k, camera.width, camera.height, 1, gl.RGBA, gl.FLOAT, map));
+      if (number === 0) {
+        if (maps) gl.deleteTexture(maps);
+        maps = texture(MAPS, gl.RGBA32F, camera.width, camera.height, cameras * found.length);
+      }
+      gl.activeTexture(gl.TEXTURE0 + MAPS);
+      found.forEach((map, k) => gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, number * found.length + k, camera.width, camera.height, 1, gl.RGBA, gl.FLOAT, map));
     }
     return found;
   }
 
-  // One frame: {camera, rows, phases, count, light}, light: the light's camera where pixels are shaded. view: {mode, plane, range, top, background}.
+  // One frame: {camera, rows, phases, count, light}, light: the light's cameras. view: {mode, plane, range, top, background}.
   function draw({ camera, rows, phases, count, light }, { mode, plane }) {
     upload(rows, phases, count);
     splats("image", IMAGE, camera, 0, count, mode, plane);
     if (pixelShadow(light) && mode === "COLOUR") splats("depths", DEPTHS, camera, 0, count, "DEPTH");
   }
-  const pixelShadow = light => !!light && made.shadow.where === "pixel" && !!maps;
+  const pixelShadow = light => light.length > 0 && made.shadow.where === "pixel";
 
   function resolve(shader, { camera, light }, { mode, range = [0, 1], top = 1, background = page.background }) {
     gl.useProgram(shader.linked);
@@ -182,10 +185,13 @@ function painter(canvas, page, made) {
     if (shaded) {
       const { R, t, fx, fy, cx, cy } = camera, columns = [];
       for (const [a, b, c] of [[1 / fx, 0, 0], [0, 1 / fy, 0], [-cx / fx, -cy / fy, 1]]) columns.push(R[0] * a + R[3] * b + R[6] * c, R[1] * a + R[4] * b + R[7] * c, R[2] * a + R[5] * b + R[8] * c, 0);
-      const eye = [0, 1, 2].map(a => -(R[a] * t[0] + R[3 + a] * t[1] + R[6 + a] * t[2])), L = light.R;
+      const eye = [0, 1, 2].map(a => -(R[a] * t[0] + R[3 + a] * t[1] + R[6 + a] * t[2]));
       gl.uniformMatrix4fv(shader.at("toScene"), false, [...columns, ...eye, 1]);
-      gl.uniformMatrix4fv(shader.at("toLight"), false, [L[0], L[3], L[6], 0, L[1], L[4], L[7], 0, L[2], L[5], L[8], 0, ...light.t, 1]);
-      gl.uniform3f(shader.at("light"), light.fx, light.near, light.diameter * made.shadow.fade);
+      const places = light.flatMap(({ R: L, t }) => [L[0], L[3], L[6], 0, L[1], L[4], L[7], 0, L[2], L[5], L[8], 0, ...t, 1]);
+      gl.uniformMatrix4fv(shader.at("toLight"), false, places);
+      gl.uniform1i(shader.at("cameras"), light.length);
+      gl.uniform3f(shader.at("source"), ...light[0].from);
+      gl.uniform3f(shader.at("light"), light[0].fx, light[0].near, light[0].diameter * made.shadow.fade);
     }
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }

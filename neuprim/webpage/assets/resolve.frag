@@ -8,7 +8,9 @@ uniform vec2 range;
 uniform float top;
 uniform bool shaded;
 uniform mat4 toScene; // (pixel x z, pixel y z, z, 1) -> scene
-uniform mat4 toLight; // scene -> the light's camera
+uniform mat4 toLight[6]; // scene -> each of the light's cameras: one, or one along each axis
+uniform int cameras;
+uniform vec3 source; // where the light is
 uniform vec3 light; // focal, near, and how far behind a depth image light fades
 out vec4 result;
 
@@ -23,8 +25,15 @@ vec3 display(vec3 c) { // sRGB
 }
 
 float arriving(vec3 point) { // as arrivingAt of shadow.js
-  vec3 x = (toLight * vec4(point, 1.0)).xyz;
+  int camera = 0;
+  if (cameras > 1) { // as facing of shadow.js
+    vec3 away = point - source, sizes = abs(away);
+    camera = sizes.x >= sizes.y && sizes.x >= sizes.z ? 0 : sizes.y >= sizes.z ? 1 : 2;
+    if (away[camera] < 0.0) camera += 3;
+  }
+  vec3 x = (toLight[camera] * vec4(point, 1.0)).xyz;
   ivec3 size = textureSize(maps, 0);
+  size.z /= cameras;
   if (!(x.z > light.y)) return 1.0;
   vec2 uv = light.x * x.xy / x.z + 0.5 * vec2(size.xy) - 0.5;
   if (any(lessThanEqual(uv, vec2(-1.0))) || any(greaterThanEqual(uv, vec2(size.xy)))) return 1.0;
@@ -36,7 +45,7 @@ float arriving(vec3 point) { // as arrivingAt of shadow.js
     for (int k = 0; k < 4; k++) {
       ivec2 step = ivec2(k & 1, k >> 1), texel = corner + step;
       if (any(lessThan(texel, ivec2(0))) || any(greaterThanEqual(texel, size.xy))) continue;
-      vec4 seen = texelFetch(maps, ivec3(texel, slab), 0);
+      vec4 seen = texelFetch(maps, ivec3(texel, camera * size.z + slab), 0);
       float opacity = 1.0 - seen.a;
       if (!(opacity > 0.0)) continue;
       vec2 share = mix(1.0 - part, part, vec2(step));

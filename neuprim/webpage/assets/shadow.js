@@ -1,8 +1,8 @@
 // Light that arrives at primitives or points, by depth images out of the light in slabs: neuprim/core/render/light.py has the mathematics.
-const FAR = 1e3; // scene radii
+const FAR = 1e3, OUTSIDE = 1 / 0.94; // scene radii
 
-// The light's camera over all living primitives, and the depths between slabs; null where the light is in the middle of everything.
-function lightCamera(scene, scales, living, light, { size, layers }) {
+// The light's camera over all living primitives; six along the axes if the light is among them. Each has the depths between its slabs.
+function lightCameras(scene, scales, living, light, { size, layers }) {
   const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
   for (const i of living) {
     for (let a = 0; a < 3; a++) {
@@ -18,25 +18,37 @@ function lightCamera(scene, scales, living, light, { size, layers }) {
   }
   const radius = far + largest;
   let away = light.map((x, a) => x - middle[a]), distance = Math.hypot(...away);
-  if (distance < 1e-9 * Math.max(radius, 1e-30)) return null;
   if (distance > FAR * radius) { // from there all rays are parallel
     away = away.map(x => (x * FAR * radius) / distance);
     distance = FAR * radius;
   }
-  const from = away.map((x, a) => x + middle[a]), up = Math.abs(away[2]) < 0.9 * distance ? [0, 0, 1] : [0, 1, 0];
-  const z = away.map(x => -x / distance), x = lib.cross(z, up), length = Math.hypot(...x);
-  for (let a = 0; a < 3; a++) x[a] /= length;
-  const y = lib.cross(z, x), R = [...x, ...y, ...z], focal = (0.5 * size) / Math.tan(Math.asin(Math.min(radius / distance, 0.94)));
-  const t = [x, y, z].map(axis => -lib.dot(axis, from));
-  let nearest = Infinity, furthest = -Infinity;
-  for (const i of living) {
-    const d = z[0] * scene[3 * i] + z[1] * scene[3 * i + 1] + z[2] * scene[3 * i + 2] + t[2];
-    nearest = Math.min(nearest, d);
-    furthest = Math.max(furthest, d);
+  const from = away.map((x, a) => x + middle[a]);
+  function towards(z, up, focal, near) {
+    const x = lib.unit(lib.cross(z, up)), y = lib.cross(z, x), t = [x, y, z].map(axis => -lib.dot(axis, from));
+    let nearest = Infinity, furthest = -Infinity;
+    for (const i of living) {
+      const d = z[0] * scene[3 * i] + z[1] * scene[3 * i + 1] + z[2] * scene[3 * i + 2] + t[2];
+      if (!(d + scales[i] > near)) continue;
+      nearest = Math.min(nearest, d);
+      furthest = Math.max(furthest, d);
+    }
+    const edges = Array.from({ length: layers - 1 }, (_, k) => nearest + ((furthest - nearest) * (k + 1)) / layers);
+    return { R: [...x, ...y, ...z], t, fx: focal, fy: focal, cx: size / 2, cy: size / 2, width: size, height: size, near, edges, from, diameter: 2 * radius };
   }
-  const edges = Array.from({ length: layers - 1 }, (_, k) => nearest + ((furthest - nearest) * (k + 1)) / layers);
-  const near = Math.max(1e-4 * radius, distance - 1.5 * radius);
-  return { R, t, fx: focal, fy: focal, cx: size / 2, cy: size / 2, width: size, height: size, near, edges, diameter: 2 * radius };
+  if (distance > OUTSIDE * radius) {
+    const up = Math.abs(away[2]) < 0.9 * distance ? [0, 0, 1] : [0, 1, 0], near = Math.max(1e-4 * radius, distance - 1.5 * radius);
+    return [towards(away.map(x => -x / distance), up, (0.5 * size) / Math.tan(Math.asin(radius / distance)), near)];
+  }
+  const axis = (a, sign) => [0, 1, 2].map(b => (a === b ? sign : 0));
+  return [0, 1, 2, 3, 4, 5].map(k => towards(axis(k % 3, k < 3 ? 1 : -1), axis((k + 1) % 3, 1), 0.5 * size - 1, 1e-4 * radius));
+}
+
+// Which of the light's cameras looks towards the point.
+function facing([camera, ...others], px, py, pz) {
+  if (!others.length) return 0;
+  const away = [px - camera.from[0], py - camera.from[1], pz - camera.from[2]], sizes = away.map(Math.abs);
+  const a = sizes.indexOf(Math.max(...sizes));
+  return away[a] < 0 ? a + 3 : a;
 }
 
 // Visibility of the point (x, y, z); light fades over `fade` scene units, the share `before` of them in front of a depth image. maps: per slab Float32Array (size, size, 4) whose first number is sum of w z and whose last is T.

@@ -1,6 +1,6 @@
 // Off the main thread: unpacks the model, prepares frames, works out shadows. Messages: {kind, ...} here and back, one frame at a time.
 function preparing(post) {
-  let engine = null, colour = null, known = "", settled = null, lit = "", camera = null, maps = null, visible = null;
+  let engine = null, colour = null, known = "", settled = null, lit = "", cameras = [], maps = [], visible = null;
 
   async function begin({ page, numbers }) {
     const tensors = await numbersOf(numbers, page.numbers, page.count);
@@ -18,36 +18,37 @@ function preparing(post) {
       settled = engine.settle(conditions);
       known = words;
     }
-    if (shadow && lit !== words) { // what the light sees has changed: the page draws it first, and asks again with the images
-      camera = settled.living.length ? lightCamera(engine.scene, engine.scales, settled.living, shadow.light(conditions), shadow) : null;
+    if (shadow && lit !== words) { // what the light sees has changed: the page draws it first, camera by camera, and asks again with the images
+      cameras = settled.living.length ? lightCameras(engine.scene, engine.scales, settled.living, shadow.light(conditions), shadow) : [];
       lit = words;
       visible = null;
-      maps = null;
-      if (camera) {
-        const count = engine.frame(camera, conditions, settled, null, rows, phases, false);
-        const ends = [...engine.within(rows, count, camera.edges), count];
-        const spent = performance.now() - start;
-        return post({ ...request, kind: "light", camera, ends, asked: request.camera, spent }, [rows.buffer, phases.buffer]);
-      }
+      maps = [];
     }
-    if (camera && maps && shadow.where === "primitive" && !visible) {
+    if (maps.length < cameras.length) {
+      const camera = cameras[maps.length], count = engine.frame(camera, conditions, settled, null, rows, phases, false);
+      const ends = [...engine.within(rows, count, camera.edges), count], place = [maps.length, cameras.length];
+      const spent = performance.now() - start;
+      return post({ ...request, kind: "light", camera, ends, place, asked: request.camera, spent }, [rows.buffer, phases.buffer]);
+    }
+    if (cameras.length && shadow.where === "primitive" && !visible) {
       const source = shadow.light(conditions), { extents = 0, before = 0 } = shadow;
-      const fade = i => shadow.fade * camera.diameter + (extents && extents * engine.extentTowards(i, source));
+      const fade = i => shadow.fade * cameras[0].diameter + (extents && extents * engine.extentTowards(i, source));
       visible = new Float64Array(engine.scales.length);
       for (const i of settled.living) {
         const [x, y, z] = engine.scene.subarray(3 * i, 3 * i + 3);
-        visible[i] = Math.fround(arrivingAt(x, y, z, camera, maps, fade(i), before));
+        const k = facing(cameras, x, y, z);
+        visible[i] = Math.fround(arrivingAt(x, y, z, cameras[k], maps[k], fade(i), before));
       }
     }
     const count = engine.frame(request.camera, conditions, settled, visible, rows, phases);
-    post({ ...request, kind: "frame", count, light: maps && camera, milliseconds: performance.now() - start }, [rows.buffer, phases.buffer]);
+    post({ ...request, kind: "frame", count, light: cameras, milliseconds: performance.now() - start }, [rows.buffer, phases.buffer]);
   }
 
   return ({ data }) => {
     if (data.kind === "begin") begin(data).catch(error => post({ kind: "fault", text: error.message }));
     if (data.kind === "frame") frame(data);
     if (data.kind === "maps") {
-      maps = data.maps;
+      maps.push(data.maps);
       frame({ ...data, kind: "frame", maps: null });
     }
   };

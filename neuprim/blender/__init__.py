@@ -24,7 +24,8 @@ def write_blender_addon(file: Path) -> None:
     manifest = (ADDON / "blender_manifest.toml").read_text(encoding="utf-8")
     contents = {
         "blender_manifest.toml": manifest.replace("VERSION", __version__),
-        **{name: (ADDON / name).read_text(encoding="utf-8") for name in ("__init__.py", "job.py")},
+        "__init__.py": (ADDON / "addon.py").read_text(encoding="utf-8"),
+        "job.py": (ADDON / "job.py").read_text(encoding="utf-8"),
         "installation.json": json.dumps({"python": sys.executable}),
     }
     with checked_atomic_path(file) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:

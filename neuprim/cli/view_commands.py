@@ -56,6 +56,8 @@ def _add_render_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--layers", metavar="NAME,...", help=layers)
     datatype = "precision of colour and alpha in an .exr (default: float); other layers are always float"
     parser.add_argument("--datatype", choices=("half", "float"), help=datatype)
+    colors = "OpenColorIO colour space of layers of light in an .exr, e.g. ACEScg (default: linear Rec. 709)"
+    parser.add_argument("--colorspace", metavar="NAME", help=colors)
     rate = "frames per second of an animation (default: it lasts about four seconds), and in headers of .exr files"
     parser.add_argument("--fps", type=parse_rate, metavar="F", help=rate)
     parser.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
@@ -93,7 +95,9 @@ def _render_command(arguments: argparse.Namespace) -> int:
 
     if arguments.shutter is None and arguments.shutter_samples is not None:
         raise ConfigError("--shutter-samples: needs --shutter, too; pass for example --shutter 0.5")
-    names = "size format out frame frames conditions fps space layers datatype shutter shutter_samples".split()
+    names = (
+        "size format out frame frames conditions fps space layers datatype colorspace shutter shutter_samples".split()
+    )
     given = {name: value for name in names if (value := getattr(arguments, name)) is not None}
     request = RenderRequest(
         camera, environment=environment, overrides=arguments.overrides, overwrite=arguments.force, **given

@@ -42,6 +42,7 @@ from neuprim.core.render.output import mean_depth
 from neuprim.core.task import TaskSpec
 from neuprim.core.validation import Range, validate_settings, validate_value
 from neuprim.plugins.attribution import draw_task_layer
+from neuprim.runs.color_space import REC709, OutputColorSpace
 from neuprim.runs.shutter import Shutter
 from neuprim.version import __version__
 
@@ -51,7 +52,6 @@ __all__ = ["RenderConfig", "parse_run_rendering"]
 
 _MOST_LIGHTS = 128
 _COVERAGE = "(alpha)"  # no name of a layer
-_REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # sRGB primaries: x and y of red, green, blue, white
 
 
 def estimate_run_file_bytes(path: Path, full: Primitives, reduced: Primitives) -> int:
@@ -187,9 +187,11 @@ class RunExrLayers:
         fps: frames per second of the sequence that the images belong to; None if unknown.
         shutter: shutter of the motion blur, which averages each layer over sub-frames, and depth with alpha as weight;
             None: no motion blur.
+        color_space: colour space of the layers that hold light; None: linear Rec. 709.
 
     Raises:
-        ConfigError: a layer is unknown, or holds light although the model's colours are not linear light.
+        ConfigError: a layer is unknown, or holds light although the model's colours are not linear light, or a colour
+            space is given although the channels are not R, G, B.
     """
 
     run_dir: Path
@@ -203,9 +205,13 @@ class RunExrLayers:
     world: World = field(default_factory=World)
     fps: float | None = None
     shutter: Shutter | None = None
+    color_space: OutputColorSpace | None = None
 
     def __post_init__(self) -> None:
         self._layer_specs()
+        if self.color_space is not None and not self.channels.is_rgb:
+            found = ", ".join(self.channels.names)
+            raise ConfigError(f"--colorspace {self.color_space.name}: expected channels R, G, B; found {found}")
 
     @property
     def _splits_lights(self) -> bool:
@@ -305,7 +311,10 @@ class RunExrLayers:
             if name == "depth":
                 image = mean_depth(image, found[_COVERAGE]) / self.world.scale
             image = image.float()
-            half = self.half and (spec is None or spec.light or name == "alpha")
+            light = spec is None or spec.light
+            if light and self.color_space is not None:
+                image = self.color_space.convert(image)
+            half = self.half and (light or name == "alpha")
             names = self.channels.names if spec is None or not spec.channels else spec.channels
             prefix = "" if name in ("beauty", "alpha") else f"{name}."
             channels |= {f"{prefix}{c}": ExrChannel(image[..., i], half) for i, c in enumerate(names)}
@@ -321,6 +330,10 @@ class RunExrLayers:
         space = self.channels.color_space
         near = resolve_near(self.point.settings, model.params["means"], [view.camera]).near_plane
         origin = "" if space == "linear" else ", of a model whose colours are sRGB values"
+        background = _linear_light_of_run_layer(self.background[None, None], space)[0, 0]
+        if self.color_space is not None:
+            background = self.color_space.convert(background)
+            origin += f", in {self.color_space.name}"
         found = {
             **camera_exr_attributes(self.world.world_camera(view.camera), near / self.world.scale),
             "software": f"neuprim {__version__}",
@@ -328,10 +341,14 @@ class RunExrLayers:
             "neuprim:task": self.task.name,
             "neuprim:view": view.name,
             "neuprim:colorSpace": f"linear light{origin}",
-            "neuprim:background": _linear_light_of_run_layer(self.background[None, None], space)[0, 0].tolist(),
+            "neuprim:background": background.tolist(),
         }
+        if self.color_space is not None:
+            found["oiio:ColorSpace"] = self.color_space.name
         if self.channels.is_rgb:
-            found["chromaticities"] = _REC709
+            chromaticities = REC709 if self.color_space is None else self.color_space.chromaticities
+            if chromaticities is not None:
+                found["chromaticities"] = chromaticities
         if self.fps is not None:
             broadcast = Fraction(round(1.001 * self.fps) * 1000, 1001)  # 23.976 means 24000/1001
             close = abs(broadcast - self.fps) < 0.002

@@ -29,6 +29,7 @@ from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.model.fields import Conditions
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.attribution import call_task_facts, call_task_orbit
+from neuprim.runs.color_space import load_output_color_space
 from neuprim.runs.measure import render_light_sum
 from neuprim.runs.open import StoredRun, load_dataset, load_run, move_to_render_device, refuse_run_results
 from neuprim.runs.render_config import RunExrLayers, parse_run_rendering
@@ -65,6 +66,7 @@ class RenderRequest:
         environment: environment map that replaces the task's light.
         overrides: render settings, see :class:`~neuprim.runs.render_config.RenderConfig`.
         layers: layers of an OpenEXR file, separated by commas; None for all layers except those of single lights.
+        colorspace: name of an OpenColorIO colour space for layers of light in OpenEXR files; None: linear Rec. 709.
         datatype: type of alpha and layers of light in OpenEXR files: "half" (16 bits) or "float" (32 bits, default).
         space: coordinates of cameras in files, lights and depths: "world" (coordinates of the data's files) or "scene"
             (coordinates of the model).
@@ -87,6 +89,7 @@ class RenderRequest:
     overrides: Sequence[str] = ()
     layers: str | None = None
     datatype: str | None = None
+    colorspace: str | None = None
     space: str = WORLD
     overwrite: bool = False
     frame: str | None = None
@@ -160,12 +163,17 @@ class _RunRenderSession:
         usual = suffix if suffix in FORMATS else "webp" if animated else "png"
         self.format = request.format or usual
         self.animate = self.format in ANIMATIONS and len(self.views) > 1
-        for option, value in (("--layers", request.layers), ("--datatype", request.datatype)):
+        for option, value in (
+            ("--layers", request.layers),
+            ("--datatype", request.datatype),
+            ("--colorspace", request.colorspace),
+        ):
             if value is not None and self.format != "exr":
                 raise ConfigError(f"{option} {value}: only for OpenEXR; expected --format exr, found {self.format}")
         half, drawn = request.datatype == "half", (self.channels, self.render_config, self.background)
         layers = RunExrLayers(run.directory, self.task, *drawn, request.layers, half, self.lights, self.world, self.fps)
-        layers = replace(layers, shutter=self.shutter)
+        colors = None if request.colorspace is None else load_output_color_space(request.colorspace)
+        layers = replace(layers, shutter=self.shutter, color_space=colors)
         self.layers = layers if self.format == "exr" else None
         if self.channels.hides_channels and self.format not in ("exr", "npy"):
             notify(f"shown: {self.channels.display_text}; --format exr and npy hold all channels")

@@ -24,6 +24,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.layer_frame import LayerSpec
 from neuprim.plugins.attribution import ReturnError
+from neuprim.runs.color_space import load_output_color_space
 from neuprim.runs.measure import render_light_sum
 from neuprim.runs.render_config import RenderConfig, RunExrLayers
 from neuprim.runs.render_images import _run_views_of_camera_file, _view_file_names, set_run_view_conditions
@@ -271,3 +272,27 @@ def test_a_files_times_are_the_frames_where_the_task_has_a_time() -> None:
 def test_no_two_views_share_a_file() -> None:
     assert _view_file_names(("a/b", "c d")) == ["a_b", "c_d"]
     assert _view_file_names(("a/b", "a_b", "A_B")) == ["000_a_b", "001_a_b", "002_A_B"]
+
+
+def test_only_layers_of_light_are_converted(tmp_path: Path) -> None:
+    space, model = load_output_color_space("ACEScg"), volume()
+    plain, head = written(tmp_path / "plain.exr", layers(), model, VIEW)
+    found, converted = written(tmp_path / "aces.exr", layers(color_space=space), model, VIEW)
+    assert found.keys() == plain.keys()
+    for prefix in ("", "emission.", "absorption."):
+        was, now = (torch.stack([file[prefix + c] for c in "RGB"], -1) for file in (plain, found))
+        assert float(was.max()) > 0.1 and torch.allclose(now, space.convert(was), atol=1e-6)
+    for name in ("A", "depth.Z", "density.Y"):
+        assert torch.equal(found[name], plain[name])
+    assert converted["oiio:ColorSpace"] == "ACEScg" and "oiio:ColorSpace" not in head
+    assert converted["neuprim:colorSpace"] == "linear light, in ACEScg"
+    assert np.allclose(converted["chromaticities"], space.chromaticities)
+    background = space.convert(torch.tensor(head["neuprim:background"]))
+    assert np.allclose(converted["neuprim:background"], background)
+    _, unknown = written(tmp_path / "p3.exr", layers(color_space=load_output_color_space("Linear P3-D65")), model, VIEW)
+    assert "chromaticities" not in unknown
+
+
+def test_colour_spaces_need_colours() -> None:
+    with pytest.raises(ConfigError, match="expected channels R, G, B; found a, b"):
+        layers(color_space=load_output_color_space("ACEScg"), channels=Channels(("a", "b"), color_space="linear"))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, final
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, final
 
 import numpy as np
 import torch
@@ -269,12 +269,19 @@ class PointSamples:
     scattered_scale: float = 1.0  # typical ``scattered`` inside matter
 
 
+class ChannelRange(NamedTuple):
+    """Range of a channel (a grid besides the extinction) in all frames. Values that files do not store are 0."""
+
+    largest: float  # largest absolute value
+    width: int  # numbers per voxel, 1 or 3
+    lowest: float  # smallest value, at most 0: the model's values are limited to it
+
+
 class PointSupervision(ABC):
     """Base class of objects that draw points of a volume with ground truth, to train on points besides images."""
 
     components: tuple[str, ...] = ()  # names of the source grids in PointSamples.components
-    channels: Mapping[str, tuple[float, int]] = MappingProxyType({})
-    """Name of each channel (grid besides the extinction) -> its largest absolute value, and its numbers per voxel."""
+    channels: Mapping[str, ChannelRange] = MappingProxyType({})  # by the channel's name
 
     @abstractmethod
     def draw(self, count: int, generator: torch.Generator) -> PointSamples:

@@ -67,7 +67,7 @@ def _build_time_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[Dens
     grids: dict[str, Any] = {}
     if dataset.points is not None:
         grids["components"] = dataset.points.components
-        grids["channels"] = [(name, *size) for name, size in dataset.points.channels.items()]
+        grids["channels"] = [(name, *own) for name, own in dataset.points.channels.items()]
     density = TimeDensity(model["neurons"], **model["density"], **grids)
     settings = (model["sh_degree"], dataset.channels, model["sh_every"])
     if "light" in dataset.train.view(0).conditions:

@@ -31,6 +31,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute import device
+from neuprim.core.data.dataset import ChannelRange
 from neuprim.core.model.cosine import (
     OMEGA0,
     CosineDensity,
@@ -108,7 +109,7 @@ class TimeDensity(DensityField):
     Args:
         seams: overlaps in time of the chunks from which a model was joined; empty for other models.
         components: names of the source grids whose share of the extinction each primitive stores.
-        channels: name of each channel, its largest absolute value in the source, and its numbers per voxel (1 or 3).
+        channels: name of each channel, and the values of its :class:`ChannelRange`.
     """
 
     init_settings = (*CosineDensity.init_settings, "window", "window_frames", "rate")
@@ -129,7 +130,7 @@ class TimeDensity(DensityField):
         if isinstance(components, str) or not all(isinstance(name, str) and name.isidentifier() for name in components):
             raise ValueError(f"components {components!r}; expected a list of names")
         self.named = tuple(components)
-        self.sizes = _validate_channels(channels)
+        self.ranges = _validate_channels(channels)
 
     def settings(self) -> dict[str, Any]:
         settings = {**self.static.settings(), "time": self.time}
@@ -137,13 +138,13 @@ class TimeDensity(DensityField):
             settings["seams"] = [list(overlap) for overlap in self.seams]
         if self.named:
             settings["components"] = list(self.named)
-        if self.sizes:
-            settings["channels"] = [[name, size, width] for name, (size, width) in self.sizes.items()]
+        if self.ranges:
+            settings["channels"] = [[name, *own] for name, own in self.ranges.items()]
         return settings
 
     @classmethod
     def every_parameter(cls) -> list[ParameterSpec]:
-        grids: dict[str, Any] = {"components": ("density", "temperature"), "channels": [("temperature", 1.0, 1)]}
+        grids: dict[str, Any] = {"components": ("density", "temperature"), "channels": [("temperature", 1.0, 1, 0.0)]}
         return cls(time="+".join(TIME_PARTS), gain=True, seams=[(0.0, 1.0)], **grids).parameters()
 
     def parameters(self) -> list[ParameterSpec]:
@@ -162,15 +163,16 @@ class TimeDensity(DensityField):
         if self.seams:
             specs.append(ParameterSpec("chunk", (1,), 0.0, _zero_time_parameters(1)))
         specs += [ParameterSpec(_SHARE + name, (1,), 0.3, _zero_time_parameters(1)) for name in self.named]
-        for name, (_, width) in self.sizes.items():
-            specs.append(ParameterSpec(CHANNEL + name, (width,), 1e-1, _zero_time_parameters(width)))
+        for name, (largest, width, lowest) in self.ranges.items():
+            zero = _zero_time_parameters(width)
+            specs.append(ParameterSpec(CHANNEL + name, (width,), 1e-1, zero, low=lowest / largest))
         return specs
 
     def components(self, params: Params) -> dict[str, Tensor]:
         return {name: params[_SHARE + name].sigmoid().reshape(-1) for name in self.named}
 
     def channels(self, params: Params) -> dict[str, Tensor]:
-        return {name: params[CHANNEL + name] * size for name, (size, _) in self.sizes.items()}
+        return {name: params[CHANNEL + name] * own.largest for name, own in self.ranges.items()}
 
     def largest(self, params: Params, geometry: Geometry) -> Tensor:
         changed = dict(params)
@@ -282,17 +284,21 @@ class TimeDensity(DensityField):
         return scaled
 
 
-def _validate_channels(channels: Sequence[Sequence[Any]]) -> dict[str, tuple[float, int]]:
-    """Convert (name, largest absolute value, numbers per voxel) to a dict; raise ValueError if anything is wrong."""
+def _validate_channels(channels: Sequence[Sequence[Any]]) -> dict[str, ChannelRange]:
+    """Convert (name, values of a :class:`ChannelRange`) to a dict; raise ValueError if anything is wrong."""
     try:
-        sizes = {str(name): (float(size), int(width)) for name, size, width in channels}
-        sound = all(name.isidentifier() for name in sizes) and len(sizes) == len(channels)
-        sound = sound and all(0 < size < math.inf and width in (1, 3) for size, width in sizes.values())
+        ranges = {str(name): ChannelRange(float(most), int(width), float(low)) for name, most, width, low in channels}
+        sound = all(name.isidentifier() for name in ranges) and len(ranges) == len(channels)
+        sound = sound and all(
+            0 < own.largest < math.inf and own.width in (1, 3) and -own.largest <= own.lowest <= 0
+            for own in ranges.values()
+        )
     except (TypeError, ValueError, OverflowError):
         sound = False
     if not sound:
-        raise ValueError(f"channels {channels!r}; expected a name, a number above 0, and 1 or 3, for each")
-    return sizes
+        expected = "a name, a number above 0, 1 or 3, and a number from minus the first to 0, for each"
+        raise ValueError(f"channels {channels!r}; expected {expected}")
+    return ranges
 
 
 def _advance_phase_in_time(b1: Tensor, W_t: Tensor, xi: Tensor, turn: float) -> Tensor:

@@ -68,7 +68,7 @@ def test_samples_have_the_values_of_the_files(scale: float, tmp_path: Path) -> N
     write_vdb(tmp_path / "hot_0.vdb", [*blob(8.0, ("density",)), heat(scale), wind()])
     write_vdb(tmp_path / "hot_1.vdb", blob(9.0, ("density",)))
     data = dataset(tmp_path, tmp_path, channels=["heat", "wind"])
-    assert isinstance(data.points, FrameVoxels) and data.points.channels["wind"] == (79.5, 3)
+    assert isinstance(data.points, FrameVoxels) and data.points.channels["wind"][:2] == (79.5, 3)
     assert data.points.channels["heat"][0] == pytest.approx(max(-COLD, COLD + SLOPE * (28 - scale / VOXEL)), rel=1e-6)
     capture, generator = recorded(data).capture, torch.Generator().manual_seed(0)
     for _ in range(8):
@@ -85,7 +85,10 @@ def test_samples_have_the_values_of_the_files(scale: float, tmp_path: Path) -> N
 
 def test_the_value_is_the_mean_over_primitives_weighted_by_extinction() -> None:
     generator = torch.Generator().manual_seed(1)
-    density, colour = TimeDensity(0, "none", channels=[("heat", 400.0, 1), ("wind", 2.0, 3)]), TimeHarmonics(0)
+    density, colour = (
+        TimeDensity(0, "none", channels=[("heat", 400.0, 1, -400.0), ("wind", 2.0, 3, 0.0)]),
+        TimeHarmonics(0),
+    )
     specs = [*GEOMETRY_SPECS, *density.parameters(), *colour.parameters()]
     params = {spec.name: torch.rand((40, *spec.shape), generator=generator, dtype=torch.float64) for spec in specs}
     params |= {"log_scales": params["log_scales"] - 1.5, "channel_heat": params["channel_heat"] - 0.5}
@@ -100,14 +103,21 @@ def test_the_value_is_the_mean_over_primitives_weighted_by_extinction() -> None:
         prim = torch.full((int(inside.sum()),), i)
         sigma[inside, i] = active.sigma(prim, points[inside]).clamp_min(0)
     assert (sigma.sum(1) > 0).sum() > 50
-    for name, (size, _) in density.sizes.items():
+    for name, (size, *_) in density.ranges.items():
         true = (sigma @ params[f"channel_{name}"]) * size / sigma.sum(1, keepdim=True).clamp_min(1e-300)
         assert torch.allclose(found[name].double(), true, rtol=1e-4, atol=1e-4 * size)
 
 
+def test_values_stay_above_those_of_the_files() -> None:
+    """Otherwise, exported grids would have values that the source never has, such as negative flames."""
+    density = TimeDensity(0, "none", channels=[("heat", 400.0, 1, -100.0), ("flames", 2.0, 1, 0.0)])
+    lows = {spec.name: spec.low for spec in density.parameters() if spec.name.startswith("channel_")}
+    assert lows == {"channel_heat": -0.25, "channel_flames": 0.0}
+
+
 def test_wrong_extinction_is_no_error_of_a_channel() -> None:
     generator = torch.Generator().manual_seed(2)
-    density, colour = TimeDensity(0, "none", channels=[("heat", 400.0, 1)]), TimeHarmonics(0)
+    density, colour = TimeDensity(0, "none", channels=[("heat", 400.0, 1, 0.0)]), TimeHarmonics(0)
     specs = [*GEOMETRY_SPECS, *density.parameters(), *colour.parameters()]
     params = {spec.name: torch.rand((40, *spec.shape), generator=generator) for spec in specs}
     params |= {"log_scales": params["log_scales"] - 1.5}
@@ -147,7 +157,7 @@ def test_a_run_exports_its_channels_with_errors(files: Path, tmp_path: Path) -> 
         wrong = (found.to_dense(density.bounds) - truth)[density.to_dense() > 0.2]
         assert np.sqrt(np.square(wrong).mean()) < 0.15 * np.abs(truth).max()
     assert any(note.startswith("channels heat, wind:") for note in report.notes)
-    assert open_run(out).model.density.settings()["channels"] == [["heat", 830.0, 1], ["wind", 79.5, 3]]
+    assert open_run(out).model.density.settings()["channels"] == [["heat", 830.0, 1, -250.0], ["wind", 79.5, 3, -16.5]]
     stored = open_run(out)
     assert main(["compress", str(out), "--seconds", "0"]) == 0
     small = load_model_checkpoint(out / "model.neuprim", stored.task)[0]
@@ -192,11 +202,12 @@ def test_channels_need_voxels(files: Path, tmp_path: Path) -> None:
         run(composed(files, tmp_path / "run", "train.supervision=images"))
 
 
-DAMAGED: list[Any] = [["heat"], [["heat", 1.0]], [["a b", 1.0, 1]], [["heat", 0.0, 1]], [["heat", "x", 1]], 7,
-    [["heat", 1.0, 2]], [["heat", float("nan"), 1]], [["heat", 1.0, 1]] * 2]  # fmt: skip
+DAMAGED: list[Any] = [7, ["heat"], [["heat", 1.0, 1]], [["a b", 1.0, 1, 0]], [["heat", 0.0, 1, 0]],
+    [["heat", "x", 1, 0]], [["heat", 1.0, 2, 0]], [["heat", float("nan"), 1, 0]], [["heat", 1.0, 1, 0]] * 2,
+    [["heat", 1.0, 1, 0.1]], [["heat", 1.0, 1, -1.1]], [["heat", 1.0, 1, float("nan")]]]  # fmt: skip
 
 
 @pytest.mark.parametrize("channels", DAMAGED)
 def test_damaged_channels_of_a_model_are_refused(channels: Any) -> None:
-    with pytest.raises(ValueError, match="expected a name, a number above 0, and 1 or 3, for each"):
+    with pytest.raises(ValueError, match="expected a name, a number above 0, 1 or 3, and a number from minus the"):
         TimeDensity(0, channels=channels)

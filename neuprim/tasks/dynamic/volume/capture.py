@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.data.dataset import DatasetImages
+from neuprim.core.data.dataset import ChannelRange, DatasetImages
 from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io.exr import write_exr
 from neuprim.core.io.files import write_json
@@ -65,7 +65,7 @@ class Capture:
         bounds: (2, 3) box around all matter, scene units.
         ends: numbers of the frames with time 0 and 1; None for the first and the last frame.
         measured: frame number -> extent of its extinction grid; empty if unknown.
-        channels: names of the grids that models learn besides the look -> largest absolute value, numbers per voxel.
+        channels: names of the grids that models learn besides the look -> range of their values.
     """
 
     frames: Sequence[VdbFrame]
@@ -79,7 +79,7 @@ class Capture:
     held_out: int = 0
     ends: tuple[int, int] | None = None
     measured: Mapping[int, GridExtent] = field(default_factory=dict)
-    channels: Mapping[str, tuple[float, int]] = field(default_factory=dict)
+    channels: Mapping[str, ChannelRange] = field(default_factory=dict)
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -142,7 +142,7 @@ class Capture:
         back = np.linalg.inv(self.normalisation.matrix())
         world = points @ back[:3, :3].T + back[:3, 3]
         stored = {grid.name for grid in read_header(frame.path).grids}
-        found = {name: np.zeros((len(points), width), np.float32) for name, (_, width) in self.channels.items()}
+        found = {name: np.zeros((len(points), own.width), np.float32) for name, own in self.channels.items()}
         for grid in read_grids(frame.path, [name for name in self.channels if name in stored]):
             try:
                 found[grid.name] = sample_vdb_grid(grid, world)

@@ -270,7 +270,7 @@ class FrameVoxels(PointSupervision):
             return {}
         drawn = torch.from_numpy(take_voxel_rows(voxels.channels, rows))
         found, first = dict[str, tuple[Tensor, float]](), 0
-        for name, (size, width) in self.channels.items():
+        for name, (size, width, _) in self.channels.items():
             columns = slice(first, first + width)
             typical = float(voxels.channel_squares[columns].mean()) ** 0.5 or sigma * size
             found[CHANNEL + name] = (drawn[:, columns].contiguous(), typical)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from neuprim.core.data.dataset import ChannelRange
 from neuprim.core.errors import DataError, nearest
 from neuprim.core.io.vdb import DENSE_LIMIT, VdbFrame, VdbGrid, read_grids, read_header
 from neuprim.core.volumes.density_truth import GridExtent
@@ -134,27 +135,29 @@ def find_volume_grids(frames: Sequence[VdbFrame], chosen: Mapping[str, str]) -> 
 
 def measure_vdb_channels(
     frames: Sequence[VdbFrame], names: Sequence[str], progress: Callable[[str, float], None]
-) -> dict[str, tuple[float, int]]:
-    """Return the largest absolute value of each of the grids ``names`` in all frames, and its numbers per voxel.
+) -> dict[str, ChannelRange]:
+    """Return the range of each of the grids ``names`` in all frames.
 
     Raises:
         DataError: no frame has a grid, or a grid cannot be read, is 0 everywhere, or differs in numbers per voxel.
     """
-    found: dict[str, tuple[float, int]] = {}
+    found: dict[str, ChannelRange] = {}
     folder, stored = frames[0].path.parent, set[str]()
     for i, frame in enumerate(frames if names else ()):
         progress("measuring channels", i / len(frames))
         in_file = {grid.name for grid in read_header(frame.path).grids}
         stored |= in_file
         for grid in read_grids(frame.path, [name for name in names if name in in_file]):
-            largest, width = found.get(grid.name, (0.0, grid.channels))
+            largest, width, lowest = found.get(grid.name, ChannelRange(0.0, grid.channels, 0.0))
             if grid.channels != width:
                 what = f"grid {grid.name!r} has {grid.channels} numbers per voxel"
                 raise DataError(f"{frame.path}: {what}; expected {width}, as in earlier frames")
             values = grid.active_values()
-            found[grid.name] = max(largest, float(np.abs(values[np.isfinite(values)]).max(initial=0.0))), width
+            values = values[np.isfinite(values)]
+            largest = max(largest, float(np.abs(values).max(initial=0.0)))
+            found[grid.name] = ChannelRange(largest, width, min(lowest, float(values.min(initial=0.0))))
     for name in names:
-        if not found.get(name, (0.0, 1))[0]:
+        if name not in found or not found[name].largest:
             problem = "the grid is 0 in all frames" if name in found else "no frame has such a grid"
             raise DataError(f"{folder}: scene.channels={name}: {problem}{nearest(name, stored - {name})}")
     return found

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from neuprim.core.data import Dataset, DataSource
+from neuprim.core.data.dataset import ChannelRange
 from neuprim.core.errors import ConfigError, DataError, warn_once
 from neuprim.core.io.store import Store, open_store
 from neuprim.core.io.vdb import VdbFrame, list_vdb_files
@@ -263,7 +264,7 @@ def _prepare_vdb_scene(
     optics = options.resolve_optics("density" in reader.names)
     reader = reader.with_extinction(optics.extinction_grids, folder)
     measured: Mapping[int, GridExtent] = {}
-    channels: Mapping[str, tuple[float, int]] = {}
+    channels: Mapping[str, ChannelRange] = {}
     train, test = hemisphere_capture_cameras(
         options.size, options.cameras, up=options.up, field_of_view=options.field_of_view
     )

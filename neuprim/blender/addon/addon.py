@@ -100,9 +100,9 @@ def fit(context: bpy.types.Context, resume: bool) -> Job:
     if source.data.is_sequence:
         first = source.data.frame_offset + 1
         words.append(f"scene.frames={first}:{first + source.data.frame_duration - 1}")
-    lit = settings.preset != "preview" and settings.lit
-    words += ["preset=preview"] if settings.preset == "preview" else ["scene.lights=4"] if lit else []
+    words += ["preset=preview"] if settings.preset == "preview" else ["scene.lights=4"] if settings.lit else []
     words += shlex.split(settings.extra)
+    lit = any(re.fullmatch(r"scene\.lights=(?!1$)\d+", word) for word in words)
     if settings.folder.startswith("//") and not bpy.data.is_saved:
         raise InputError("save the .blend file first, or choose a folder for the models")
     run = choose_run_directory(Path(bpy.path.abspath(settings.folder)), source.name, resume)
@@ -116,7 +116,7 @@ def fit(context: bpy.types.Context, resume: bool) -> Job:
     def finish(job: Job) -> str:
         files = [file for file in job.files[1] if file.suffix == ".vdb"]
         show_model(bpy.data.objects[name], run, files[0], lit)
-        return f"{source_summary(run)}; report: {run / 'report.html'}"
+        return f"{fit_summary(run)}; report: {run / 'report.html'}"
 
     return Job(f"fit {name}", commands, finish)
 
@@ -145,7 +145,7 @@ def file_stem(name: str) -> str:
     return re.sub(r"[^\w.-]+", "_", name)
 
 
-def source_summary(run: Path) -> str:
+def fit_summary(run: Path) -> str:
     psnr = json.loads((run / "metrics.json").read_text(encoding="utf-8"))["psnr"]
     return f"held-out images: {psnr:.1f} dB"
 

@@ -179,6 +179,12 @@ def check_interrupted_fit(addon: Any, settings: Any) -> None:
     refused(bpy.ops.neuprim.fit, "no interrupted fit of ball_1001", resume=True)
     assert bpy.ops.neuprim.fit() == {"FINISHED"}
     assert sorted(path.name for path in run.parent.iterdir()) == ["ball_1001", "ball_1001_2"]
+
+    addon._job = addon.fit(bpy.context, resume=False)
+    source.name = "renamed"
+    while addon._follow() is not None:
+        time.sleep(0.1)
+    assert addon._message.startswith("ball_1001 is gone; its model is in ") and addon._failed
     assert json.loads((run / "metrics.json").read_text())["psnr"] > 0
 
 

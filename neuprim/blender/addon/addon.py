@@ -53,11 +53,11 @@ def _follow() -> float | None:
     """Redraw the panel while the job runs, then finish it; Blender calls this every 0.3 seconds until it is None."""
     global _job, _message, _failed
     if _job is not None and not _job.running:
+        done, _job = _job, None
         try:
-            _message, _failed = _job.finish(), False
+            _message, _failed = done.finish(), False
         except InputError as error:
             _message, _failed = str(error), True
-        _job = None
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
@@ -115,6 +115,8 @@ def fit(context: bpy.types.Context, resume: bool) -> Job:
 
     def finish(job: Job) -> str:
         files = [file for file in job.files[1] if file.suffix == ".vdb"]
+        if name not in bpy.data.objects:
+            raise InputError(f"{name} is gone; its model is in {run}")
         show_model(bpy.data.objects[name], run, files[0], lit)
         return f"{fit_summary(run)}; report: {run / 'report.html'}"
 

@@ -92,7 +92,16 @@ def check_fit_and_render(addon: Any, settings: Any) -> None:
     shown.data.sequence_mode = "REPEAT"  # more frames than files: several commands
     assert bpy.ops.neuprim.render(animation=True) == {"FINISHED"}
     assert len(list((run / "blender").iterdir())) == 7
-    assert bpy.ops.neuprim.render.poll()
+    for path in (run / "blender").iterdir():
+        path.unlink()
+    job = addon.render(bpy.context, animation=True)
+    job.wait()
+    job.error = "cancelled"
+    try:
+        job.finish()
+    except addon.InputError as error:
+        assert str(error) == "cancelled"
+    assert len(list((run / "blender").iterdir())) == 7, "what was rendered before is kept"
 
 
 def check_sun(addon: Any, settings: Any) -> None:

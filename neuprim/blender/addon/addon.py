@@ -9,6 +9,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -38,7 +39,7 @@ def start(operator: bpy.types.Operator, job: Job) -> set[str]:
     global _job, _message, _failed
     if not bpy.app.background:
         _job, _message = job, ""
-        bpy.app.timers.register(_follow, first_interval=0.2)
+        bpy.app.timers.register(_follow, first_interval=0.2, persistent=True)  # even if another file is opened
         return {"FINISHED"}
     job.wait()
     try:
@@ -114,6 +115,7 @@ def fit(context: bpy.types.Context, resume: bool) -> Job:
     name = source.name
 
     def finish(job: Job) -> str:
+        job.check()
         files = [file for file in job.files[1] if file.suffix == ".vdb"]
         if name not in bpy.data.objects:
             raise InputError(f"{name} is gone; its model is in {run}")
@@ -200,19 +202,23 @@ def render(context: bpy.types.Context, animation: bool) -> Job:
         commands.append(neuprim(context, "render", run, *words))
 
     def finish(job: Job) -> str:
-        written = [file for files in job.files for file in files]
-        targets = [folder / f"{file_stem(name)}.{shot['frame']:04d}.exr" for shot in shots]
-        for file, target in zip(written, targets, strict=True):
-            os.replace(file, target)
-        for rest in sorted(parts.rglob("*"), reverse=True):
-            rest.rmdir() if rest.is_dir() else rest.unlink()
-        parts.rmdir()
+        targets = []
+        for k, group in enumerate(groups):  # also those of a render that was cancelled
+            for file, shot in zip(sorted((parts / str(k)).glob("*.exr"), key=last_number), group, strict=False):
+                targets.append(folder / f"{file_stem(name)}.{shot['frame']:04d}.exr")
+                os.replace(file, targets[-1])
+        shutil.rmtree(parts)
+        job.check()
         image = bpy.data.images.load(str(targets[0]), check_existing=True)
         image.source = "SEQUENCE" if len(targets) > 1 else "FILE"
         image.reload()
         return f"{targets[0]}" + (f" to {targets[-1].name}" if len(targets) > 1 else "")
 
     return Job(f"render {name}", commands, finish)
+
+
+def last_number(file: Path) -> int:
+    return int(re.findall(r"\d+", file.stem)[-1])
 
 
 def find_model(context: bpy.types.Context) -> bpy.types.Object:
@@ -290,6 +296,7 @@ def light_flags(scene: bpy.types.Scene, shown: bpy.types.Object, place: Matrix) 
     suns = [lamp for lamp in scene.objects if lamp.type == "LIGHT" and lamp.data.type == "SUN" and not lamp.hide_render]
     if len(suns) != 1:
         raise InputError(f"{len(suns)} suns light the scene; {shown.name} needs exactly one")
+    shown.data.grids.load()  # without them, the box is unknown
     corners = [Vector(corner) for corner in shown.bound_box]
     center, diagonal = sum(corners, Vector()) / 8, (corners[6] - corners[0]).length
     towards = (place.to_3x3() @ suns[0].matrix_world.to_3x3().col[2]).normalized()

@@ -25,7 +25,7 @@ class Job:
     """
 
     def __init__(self, title: str, commands: list[list[str]], finish: Callable[["Job"], str]) -> None:
-        """Start the commands. ``finish`` is called in Blender's main thread after them, and returns a message."""
+        """Start the commands. ``finish`` returns a message; :meth:`finish` calls it, also if a command failed."""
         self.title, self.text, self.progress, self.error = title, "starting", 0.0, ""
         self.files: list[list[Path]] = []
         self._finish, self._process, self._cancelled = finish, None, False
@@ -46,14 +46,13 @@ class Job:
             self._process.terminate() if os.name == "nt" else self._process.send_signal(signal.SIGINT)
 
     def finish(self) -> str:
-        """Return the message of the finished job.
+        """Return the message of the ended job, or raise InputError. Call it in Blender's main thread."""
+        return self._finish(self)
 
-        Raises:
-            InputError: a command failed.
-        """
+    def check(self) -> None:
+        """Raise InputError if a command failed."""
         if self.error:
             raise InputError(self.error)
-        return self._finish(self)
 
     def _run(self, commands: list[list[str]]) -> None:
         for command in commands:

@@ -122,9 +122,28 @@ def check_sun(addon: Any, settings: Any) -> None:
         assert bpy.ops.neuprim.render() == {"FINISHED"}
         (written,) = (Path(shown[addon.RUN]) / "blender").iterdir()
         written.rename(FOLDER / f"sun_{k}.exr")
-    (flag, where, *_), towards = (addon.light_flags(bpy.context.scene, shown, addon.rigid_inverse(shown)), None)
+    flag, where, *_ = addon.light_flags(bpy.context.scene, shown, addon.rigid_inverse(shown))
     towards = shown.matrix_world @ Vector(map(float, where.split(","))) - shown.matrix_world.translation
     assert flag == "--light" and math.degrees(towards.angle(sun.matrix_world.to_3x3().col[2])) < 0.5
+
+
+def check_usd_cameras(addon: Any, settings: Any) -> None:
+    """Write the scene's moving camera as USD, as users do, and the poses and projections that Blender computes."""
+    scene, camera = bpy.context.scene, bpy.context.scene.camera
+    scene.render.resolution_x, scene.render.resolution_y = 320, 180
+    camera.data.lens, camera.data.shift_x, camera.data.shift_y = 37, 0.1, -0.07
+    scene.frame_start, scene.frame_end, found = 5, 8, []
+    for frame in (5, 8):
+        camera.location.x, camera.rotation_euler.z = frame, 0.1 * frame
+        camera.keyframe_insert("location", frame=frame)
+        camera.keyframe_insert("rotation_euler", frame=frame)
+    bpy.ops.wm.usd_export(filepath=str(FOLDER / "shot.usda"), export_animation=True)
+    for frame in range(5, 9):
+        scene.frame_set(frame)
+        projection = camera.calc_matrix_camera(bpy.context.evaluated_depsgraph_get(), x=320, y=180)
+        matrices = (camera.matrix_world.normalized(), projection)
+        found.append([[list(row) for row in matrix] for matrix in matrices])
+    (FOLDER / "shot.json").write_text(json.dumps(found))
 
 
 def check_wrong_input(addon: Any, settings: Any) -> None:

@@ -16,6 +16,7 @@ import OpenEXR
 import pytest
 
 from neuprim.cli import main
+from neuprim.core.cameras.camera_files import read_camera_file
 from neuprim.version import __version__
 from tests.tasks.dynamic.sequences import write_blobs
 
@@ -80,6 +81,21 @@ def test_sun_of_blender_lights_a_model(addon: Path, tmp_path: Path) -> None:
     bright, dark = (OpenEXR.File(str(folder / f"sun_{k}.exr")).channels()["RGBA"].pixels for k in range(2))
     assert np.array_equal(bright[..., 3], dark[..., 3])
     assert bright[..., :3].mean() > 1.5 * dark[..., :3].mean()
+
+
+@pytest.mark.slow
+def test_cameras_that_blender_writes_as_usd(addon: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "files"
+    run_in_blender("usd_cameras", addon, folder)
+    named = read_camera_file(folder / "shot.usda", (320, 180)).named
+    expected = json.loads((folder / "shot.json").read_text())
+    assert len(named) == len(expected) == 4
+    for (_, camera), (pose, P) in zip(named, expected, strict=True):
+        found = np.linalg.inv(camera.viewmat.numpy())
+        found[:, 1:3] *= -1  # OpenGL axes
+        assert np.allclose(found, pose, atol=1e-6)
+        lens = (P[0][0] * 160, P[1][1] * 90, (1 - P[0][2]) * 160, (1 + P[1][2]) * 90)
+        assert np.allclose((camera.fx, camera.fy, camera.cx, camera.cy), lens, atol=1e-3), "pixels"
 
 
 @pytest.mark.slow

@@ -36,7 +36,7 @@ _message, _failed = "", False
 
 def start(operator: bpy.types.Operator, job: Job) -> set[str]:
     """Let Blender's user interface follow ``job``; without a user interface, wait for its end."""
-    global _job, _message, _failed
+    global _job, _message
     if not bpy.app.background:
         _job, _message = job, ""
         bpy.app.timers.register(_follow, first_interval=0.2, persistent=True)  # even if another file is opened
@@ -330,7 +330,7 @@ class NeuprimPreferences(bpy.types.AddonPreferences):
         name="Python of neuprim",
         description="Python of the environment in which neuprim is installed",
         subtype="FILE_PATH",
-        default=json.loads(INSTALLATION.read_text(encoding="utf-8"))["python"] if INSTALLATION.exists() else "",
+        default=json.loads(INSTALLATION.read_text(encoding="utf-8"))["python"],
     )
 
     def draw(self, context):

@@ -44,9 +44,9 @@ function lightCameras(scene, scales, living, light, { size, layers }) {
 }
 
 // Which of the light's cameras looks towards the point.
-function facing([camera, ...others], px, py, pz) {
-  if (!others.length) return 0;
-  const away = [px - camera.from[0], py - camera.from[1], pz - camera.from[2]], sizes = away.map(Math.abs);
+function facing(cameras, px, py, pz) {
+  if (cameras.length === 1) return 0;
+  const { from } = cameras[0], away = [px - from[0], py - from[1], pz - from[2]], sizes = away.map(Math.abs);
   const a = sizes.indexOf(Math.max(...sizes));
   return away[a] < 0 ? a + 3 : a;
 }

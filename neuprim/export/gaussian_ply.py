@@ -21,7 +21,7 @@ The reported error is a PSNR: images of the Gaussians, drawn as the 3DGS rasteri
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -78,12 +78,14 @@ class ExportedGaussians:
     Attributes:
         errors: PSNR of the Gaussians against the model: "psnr", the mean over views, and "psnr_worst".
         notes: lines for the user, the same for all formats.
+        measure: function that returns such errors for other Gaussians and colours, e.g. rounded ones.
     """
 
     gaussians: Gaussians
     colours: ExportHarmonics
     errors: dict[str, float]
     notes: tuple[str, ...]
+    measure: Callable[[Gaussians, ExportHarmonics], dict[str, float]]
 
     def placed(self, world: World) -> tuple[np.ndarray, ...]:
         """Return the Gaussians in the coordinates that ``world`` maps the scene to, as float64 arrays.
@@ -109,9 +111,14 @@ def fit_exported_gaussians(job: ExportJob) -> ExportedGaussians:
     colours = fit_export_harmonics(job.run, conditions).select_channels(rgb)
     images, seen = _draw_export_images(job, which, conditions, rgb)
     background = _export_background(job)[list(rgb)]
-    scores = {name: _measure_gaussian_psnrs(job, fit, colours, images, background) for name, fit in fits.items()}
-    size = max(scores, key=lambda name: float(np.mean(scores[name])))
-    gaussians, errors = fits[size], {"psnr": float(np.mean(scores[size])), "psnr_worst": float(np.min(scores[size]))}
+
+    def measure(gaussians: Gaussians, colours: ExportHarmonics) -> dict[str, float]:
+        scores = _measure_gaussian_psnrs(job, gaussians, colours, images, background)
+        return {"psnr": float(np.mean(scores)), "psnr_worst": float(np.min(scores))}
+
+    errors = {name: measure(fit, colours) for name, fit in fits.items()}
+    size = max(errors, key=lambda name: errors[name]["psnr"])
+    gaussians = fits[size]
     notes = [
         f"{len(gaussians.means)} Gaussians, size={size}; PSNR of them drawn as the 3DGS rasteriser does, against "
         f"the model's images, {seen}, {channels.color_space} values",
@@ -128,7 +135,7 @@ def fit_exported_gaussians(job: ExportJob) -> ExportedGaussians:
         )
     elif channels.display_text:
         notes.append(f"colours: {channels.display_text}")
-    return ExportedGaussians(gaussians, colours, errors, tuple(notes))
+    return ExportedGaussians(gaussians, colours, errors[size], tuple(notes), measure)
 
 
 def _write_gaussian_ply(job: ExportJob) -> ExportReport:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import math
+import struct
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -149,6 +151,20 @@ def _points(folder: Path) -> None:
 def _gaussians(folder: Path) -> None:
     names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
     _ply(folder / "points.ply", names, np.random.default_rng(0).normal(size=(5, 14)))
+
+
+def _spz(version: int) -> Callable[[Path], None]:
+    def make(folder: Path) -> None:
+        from neuprim.core.io.spz import SpzGaussians, encode_spz
+
+        some = np.random.default_rng(0).normal(size=(5, 16, 3))
+        data = encode_spz(SpzGaussians(some[:, 0], some[:, 1], some[:, :2].reshape(5, 6)[:, :4], some[:, 2, 0], some))
+        if version < 4:
+            head = struct.pack("<IIIBBBB", 0x5053474E, version, 5, 3, 12, 0, 0)
+            data = gzip.compress(head + some.tobytes()[: 5 * (9 + 1 + 3 + 3 + (3 if version < 3 else 4) + 45)])
+        (folder / "a.spz").write_bytes(data)
+
+    return make
 
 
 def _read_points(folder: Path) -> None:
@@ -444,6 +460,7 @@ def _read_checkpoint(folder: Path) -> None:
 
 
 _DATASETS, _IMAGES = "neuprim.tasks.static.datasets", "neuprim.core.io.images"
+_POINTS = "neuprim.core.data.points_file"
 
 
 _RECORDS: Files = {
@@ -472,6 +489,8 @@ FORMATS: dict[str, Format] = {
     ),
     "points": Format(_points, _read_points, {"points.ply": m.text_of, "text.ply": m.text_of}),
     "gaussians": Format(_gaussians, _read_points, {"points.ply": m.text_of}),
+    "spz": Format(_spz(4), _reader(_POINTS, "read_points", 3, "srgb"), {"a.spz": m.lies(0, 130)}),
+    "spz-gzip": Format(_spz(2), _reader(_POINTS, "read_points", 3, "srgb"), {"a.spz": m.gzipped}),
     "mesh-ply": Format(*_mesh("a.ply"), {"a.ply": m.text_of}),
     "mesh-stl": Format(*_mesh("a.stl"), {"a.stl": m.lies(0, 300)}),
     "mesh-text-ply": Format(*_mesh("text.ply"), {"text.ply": m.text_of}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
 import re
@@ -211,6 +212,11 @@ def compressed(raw: bytes, rng: Random) -> bytes:
     start = struct.pack("<IIQII", version, sections, count, len(text), len(table))
     body = raw[36 + text_size + table_size :]
     return raw[:8] + start + struct.pack("<I", zlib.crc32(start + text + table)) + text + table + body
+
+
+def gzipped(raw: bytes, rng: Random) -> bytes:
+    """Of the first 40 bytes inside a gzip stream; the check sum is right."""
+    return gzip.compress(lies(0, 40)(gzip.decompress(raw), rng))
 
 
 def glb(raw: bytes, rng: Random) -> bytes:

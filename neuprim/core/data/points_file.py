@@ -1,4 +1,4 @@
-"""Starting points from a PLY file: points with or without colours, or the Gaussians of 3D or 2D Gaussian splatting."""
+"""Starting points from a PLY or SPZ file: points with or without colours, or Gaussians of Gaussian splatting."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.lib.recfunctions import unstructured_to_structured
 from torch import Tensor
 
 from neuprim.core.data import PointCloud
 from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io import images
 from neuprim.core.io.ply import PlyVertices, read_ply
+from neuprim.core.io.spz import SPZ_FROM_DATA, read_spz
 from neuprim.core.model.sh import C0
 
-COMPRESSED = (".splat", ".spz", ".ksplat", ".sog", ".sogs", ".lcc")  # refused by name
+READABLE = (".ply", ".spz")
+COMPRESSED = (".splat", ".ksplat", ".sog", ".sogs", ".lcc")  # refused by name
 
 LINEAR = "colours are linear light"
 """Comment that marks PLY files with linear, not sRGB, colours; ``neuprim export --format gaussian-ply`` writes it."""
@@ -32,6 +35,8 @@ _COARSE = 1e-3  # coarsest rounding of coordinates without a warning, over the s
 def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
     """Read the vertices of a PLY file as starting points, in the file's own coordinates, ``means`` in float64.
 
+    An SPZ file counts as the PLY file that other tools convert it to.
+
     Colours (``f_dc_0..2``, or ``red green blue``) are sRGB, unless a comment in the file says that colours are linear.
     Colours are converted to ``color_space`` and ``channels`` channels.
     Vertices with ``scale_0..2``, ``rot_0..3`` (wxyz) and ``opacity`` (a logit) are Gaussians. With only two scales, a
@@ -40,7 +45,7 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
     """
     if path.suffix.lower() in COMPRESSED:
         raise _compressed_start_points_error(path, f"{path.suffix} is a compressed format of Gaussians")
-    found = read_ply(path)
+    found = _read_spz_vertices(path) if path.suffix.lower() == ".spz" else read_ply(path)
     if "packed_position" in found.names:
         raise _compressed_start_points_error(path, "a compressed PLY (property packed_position)")
     means = _starting_point_columns(found, ("x", "y", "z"))
@@ -88,9 +93,22 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
     return PointCloud(torch.from_numpy(means[kept]), rgb.contiguous(), {}, None, rotations, alphas, deviations)
 
 
+def _read_spz_vertices(path: Path) -> PlyVertices:
+    """Return the Gaussians of an SPZ file as vertices, with y and z negated, as other tools convert them."""
+    found = read_spz(path)
+    w, x, y, z = found.quats.T
+    quats = np.stack([-x, w, -z, y], 1)  # half turn around x
+    with np.errstate(divide="ignore"):
+        logits = np.log(found.opacities) - np.log1p(-found.opacities)
+    means = found.means @ SPZ_FROM_DATA[:3, :3]
+    table = np.concatenate([means, found.harmonics[:, 0], logits[:, None], found.log_scales, quats], 1)
+    names = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *_SCALES, *_ROTATION)
+    return PlyVertices(unstructured_to_structured(table, np.dtype([(name, "f8") for name in names])))
+
+
 def _compressed_start_points_error(path: Path, what: str) -> DataError:
     return DataError(
-        f"{path}: {what}, which is not supported; expected an uncompressed PLY. "
+        f"{path}: {what}, which is not supported; expected an uncompressed PLY or SPZ. "
         "Convert it with SuperSplat (export as PLY) or splat-transform FILE OUT.ply"
     )
 

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.data.dataset_check import check_points
 from neuprim.core.data.initial import draw_points, surrounding_points
-from neuprim.core.data.points_file import COMPRESSED, read_points
+from neuprim.core.data.points_file import COMPRESSED, READABLE, read_points
 from neuprim.core.data.starting_points import GIVE_POINTS, count_seeing_views
 from neuprim.core.errors import ConfigError, DataError, nearest
 from neuprim.core.model.fields import ColourField, DensityField
@@ -31,8 +31,9 @@ def initial_model_to_train(
     """Return an untrained model with primitives at the starting points of a data set.
 
     A primitive's size is the RMS distance from its point to the 3 nearest points. ``model.init.points`` chooses the
-    points: "matter" (the points of the data set), "box" (random in the data set's box), or a .ply file of points or 3D
-    Gaussians in the coordinate system of the data files. Gaussians also set sizes, orientations and opacities.
+    points: "matter" (the points of the data set), "box" (random in the data set's box), or a .ply file of points or a
+    .ply or .spz file of 3D Gaussians, in the coordinate system of the data files. Gaussians also set sizes,
+    orientations and opacities.
     ``model.init.scale`` multiplies all sizes. ``model.init.surroundings``, 0 by default, is the fraction of the
     primitives placed where photographs show something and the data set has no points.
 
@@ -46,14 +47,14 @@ def initial_model_to_train(
             raise ConfigError(f"model.init.{key}: no such setting{nearest(key, known)}")
     generator = torch.Generator().manual_seed(seed)
     where = settings.init.get("points", "matter")
-    if isinstance(where, str) and where.lower().endswith((".ply", *COMPRESSED)):
+    if isinstance(where, str) and where.lower().endswith((*READABLE, *COMPRESSED)):
         points = read_points(Path(where).expanduser(), dataset.channels, dataset.color_space).within(dataset.world)
         cloud = draw_points(points, settings.count, generator)
     elif where in ("matter", "box"):
         cloud = (dataset.uniform_points if where == "box" else dataset.initial_points)(settings.count, generator)
         cloud = _add_initial_surroundings(cloud, dataset, settings, generator)
     else:
-        raise ConfigError(f"model.init.points={where!r}: expected matter, box or a .ply file")
+        raise ConfigError(f"model.init.points={where!r}: expected matter, box or a .ply or .spz file")
     check_points(cloud, settings.count, dataset)
     if len(cloud.means) == 0:
         raise DataError(f"{dataset.name}: no starting points found; expected points or images with visible content")

@@ -58,6 +58,12 @@ def _add_render_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--datatype", choices=("half", "float"), help=datatype)
     colors = "OpenColorIO colour space of layers of light in an .exr, e.g. ACEScg (default: linear Rec. 709)"
     parser.add_argument("--colorspace", metavar="NAME", help=colors)
+    compression = "compression of an .exr (default: zip); dwaa is lossy"
+    parser.add_argument("--compression", choices=("zip", "piz", "dwaa"), help=compression)
+    crop = "store only the pixels of an .exr around the visible part of the model, as its data window"
+    parser.add_argument("--crop", action="store_true", help=crop)
+    deep = "write deep .exr files of at most N samples in a pixel, with depths Z to ZBack (default of N: 8)"
+    parser.add_argument("--deep", type=parse_count, nargs="?", const=8, metavar="N", help=deep)
     rate = "frames per second of an animation (default: it lasts about four seconds), and in headers of .exr files"
     parser.add_argument("--fps", type=parse_rate, metavar="F", help=rate)
     parser.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
@@ -95,9 +101,8 @@ def _render_command(arguments: argparse.Namespace) -> int:
 
     if arguments.shutter is None and arguments.shutter_samples is not None:
         raise ConfigError("--shutter-samples: needs --shutter, too; pass for example --shutter 0.5")
-    names = (
-        "size format out frame frames conditions fps space layers datatype colorspace shutter shutter_samples".split()
-    )
+    names = "size format out frame frames conditions fps space layers datatype colorspace compression crop deep".split()
+    names += ["shutter", "shutter_samples"]
     given = {name: value for name in names if (value := getattr(arguments, name)) is not None}
     request = RenderRequest(
         camera, environment=environment, overrides=arguments.overrides, overwrite=arguments.force, **given

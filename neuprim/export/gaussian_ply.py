@@ -142,7 +142,7 @@ def _write_gaussian_ply(job: ExportJob) -> ExportReport:
     fitted, space = fit_exported_gaussians(job), job.run.channels.color_space
     rows = _gaussian_ply_rows(fitted, job.run.world)
     comments = ["3D Gaussian splatting layout, fitted to neural primitives by neuprim (lossy)"]
-    comments += [LINEAR] * (space == "linear")
+    comments += ["SplatRenderMode: default", *[LINEAR] * (space == "linear")]  # read by Brush and others
     write_ply(job.out, rows, comments)
     notes = [*fitted.notes, "axes and units are those of the run's data; degree 3 harmonics"]
     if rows.dtype["x"] == np.float64:

@@ -31,7 +31,7 @@ from neuprim.core.checkpoint import read_header
 from neuprim.core.compression.file import is_compressed
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError, nearest
-from neuprim.core.io.exr import ExrChannel, write_exr_layers
+from neuprim.core.io.exr import ExrChannel, write_deep_exr, write_exr_layers
 from neuprim.core.io.images import srgb_to_linear
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import KINDS, Primitives, reduce_model, reduction_names, validate_reduction
@@ -43,6 +43,7 @@ from neuprim.core.task import TaskSpec
 from neuprim.core.validation import Range, validate_settings, validate_value
 from neuprim.plugins.attribution import draw_task_layer
 from neuprim.runs.color_space import REC709, OutputColorSpace
+from neuprim.runs.deep_images import draw_deep_image
 from neuprim.runs.shutter import Shutter
 from neuprim.version import __version__
 
@@ -188,10 +189,15 @@ class RunExrLayers:
         shutter: shutter of the motion blur, which averages each layer over sub-frames, and depth with alpha as weight;
             None: no motion blur.
         color_space: colour space of the layers that hold light; None: linear Rec. 709.
+        compression: name in :data:`~neuprim.core.io.exr.COMPRESSIONS`.
+        crop: whether files store only the pixels around the visible part of the model (the data window).
+        deep: largest number of samples of a pixel in deep files, which have only colour, alpha and depths; None: write
+            flat files.
 
     Raises:
-        ConfigError: a layer is unknown, or holds light although the model's colours are not linear light, or a colour
-            space is given although the channels are not R, G, B.
+        ConfigError: a layer is unknown, or holds light although the model's colours are not linear light; a colour
+            space is given although the channels are not R, G, B; files are cropped that store the background; or an
+            option has no meaning for deep files.
     """
 
     run_dir: Path
@@ -206,12 +212,32 @@ class RunExrLayers:
     fps: float | None = None
     shutter: Shutter | None = None
     color_space: OutputColorSpace | None = None
+    compression: str = "zip"
+    crop: bool = False
+    deep: int | None = None
 
     def __post_init__(self) -> None:
-        self._layer_specs()
+        if self.deep is not None:
+            self._check_deep()
+        names = [spec.name for spec in self._layer_specs()]
+        if self.crop and "beauty" in names and "alpha" not in names:
+            raise ConfigError("--crop: without the layer alpha, beauty contains the background; expected alpha, too")
         if self.color_space is not None and not self.channels.is_rgb:
             found = ", ".join(self.channels.names)
             raise ConfigError(f"--colorspace {self.color_space.name}: expected channels R, G, B; found {found}")
+
+    def _check_deep(self) -> None:
+        for fault, expected in (
+            (self.channels.color_space != "linear", "a model in linear light; the colours of this model are sRGB"),
+            (self.names is not None, "no --layers, as deep files have only colour, alpha and depths"),
+            (self.shutter is not None, "no --shutter"),
+            (self.crop, "no --crop, as empty pixels of deep files take no space"),
+            (self.compression != "zip", "no --compression, as deep files can use only zip"),
+            (self.point.resolution != 1.0, "resolution=1"),
+            (self.point.settings.sort != "center", "renderer.sort=center, the order of slices of depth"),
+        ):
+            if fault:
+                raise ConfigError(f"--deep: expected {expected}")
 
     @property
     def _splits_lights(self) -> bool:
@@ -244,6 +270,8 @@ class RunExrLayers:
             ConfigError: the user named a layer that the model does not have.
             DataError: the file cannot hold the values, or it cannot be written.
         """
+        if self.deep is not None:
+            return self._write_deep(path, model, view, self.deep, on_alpha)
         present = {spec.name: spec for spec in self._layer_specs()}
         mean: dict[str, Tensor] = {}
         sub_frames = [view] if self.shutter is None else self.shutter.sub_frames(view)
@@ -251,7 +279,18 @@ class RunExrLayers:
             for name, image in self._draw_layers(model, moment, present, on_alpha).items():
                 mean[name] = mean.get(name, 0.0) + image.double() / len(sub_frames)
         channels, summaries = self._exr_channels(mean, present)
-        write_exr_layers(path, channels, {**self._exr_attributes(model, view), **summaries})
+        visible = mean[_COVERAGE][..., 0] > 0 if self.crop else None
+        write_exr_layers(path, channels, {**self._exr_attributes(model, view), **summaries}, self.compression, visible)
+
+    def _write_deep(
+        self, path: Path, model: Primitives, view: View, most: int, on_alpha: Callable[[Tensor], None]
+    ) -> None:
+        image = draw_deep_image(model, view, self.point.settings, self.lights, most, on_alpha, self.world.scale)
+        light = image.rgb if self.color_space is None else self.color_space.convert(image.rgb)
+        colors = {name: light[:, i] for i, name in enumerate(self.channels.names)}
+        samples = {n: ExrChannel(v[:, None], self.half) for n, v in {**colors, "A": image.alpha}.items()}
+        samples |= {"Z": ExrChannel(image.front[:, None]), "ZBack": ExrChannel(image.back[:, None])}
+        write_deep_exr(path, image.counts, samples, self._exr_attributes(model, view))
 
     def _draw_layers(
         self, model: Primitives, view: View, present: dict[str, LayerSpec], on_alpha: Callable[[Tensor], None]

@@ -68,6 +68,9 @@ class RenderRequest:
         layers: layers of an OpenEXR file, separated by commas; None for all layers except those of single lights.
         colorspace: name of an OpenColorIO colour space for layers of light in OpenEXR files; None: linear Rec. 709.
         datatype: type of alpha and layers of light in OpenEXR files: "half" (16 bits) or "float" (32 bits, default).
+        compression: compression of OpenEXR files: "zip" (default) and "piz" are lossless, "dwaa" is not.
+        crop: whether OpenEXR files store only the pixels around the visible part of the model (the data window).
+        deep: largest number of samples of a pixel in deep OpenEXR files; None: write flat files.
         space: coordinates of cameras in files, lights and depths: "world" (coordinates of the data's files) or "scene"
             (coordinates of the model).
         overwrite: whether to replace pictures of the run's report.
@@ -90,6 +93,9 @@ class RenderRequest:
     layers: str | None = None
     datatype: str | None = None
     colorspace: str | None = None
+    compression: str | None = None
+    crop: bool = False
+    deep: int | None = None
     space: str = WORLD
     overwrite: bool = False
     frame: str | None = None
@@ -167,12 +173,17 @@ class _RunRenderSession:
             ("--layers", request.layers),
             ("--datatype", request.datatype),
             ("--colorspace", request.colorspace),
+            ("--compression", request.compression),
+            ("--crop", request.crop or None),
+            ("--deep", request.deep),
         ):
             if value is not None and self.format != "exr":
-                raise ConfigError(f"{option} {value}: only for OpenEXR; expected --format exr, found {self.format}")
+                text = option if value is True else f"{option} {value}"
+                raise ConfigError(f"{text}: only for OpenEXR; expected --format exr, found {self.format}")
         half, drawn = request.datatype == "half", (self.channels, self.render_config, self.background)
         layers = RunExrLayers(run.directory, self.task, *drawn, request.layers, half, self.lights, self.world, self.fps)
         colors = None if request.colorspace is None else load_output_color_space(request.colorspace)
+        layers = replace(layers, compression=request.compression or "zip", crop=request.crop, deep=request.deep)
         layers = replace(layers, shutter=self.shutter, color_space=colors)
         self.layers = layers if self.format == "exr" else None
         if self.channels.hides_channels and self.format not in ("exr", "npy"):

@@ -104,6 +104,20 @@ def test_beauty_without_alpha_lies_over_the_background(tmp_path: Path, space: st
     assert (rgb(found) - (expected if space == "linear" else srgb_to_linear(expected))).abs().max() < 1e-5
 
 
+def test_cropped_files_have_all_of_the_model(tmp_path: Path) -> None:
+    view = replace(VIEW, camera=scenes.camera(60, 40, distance=9.0))
+    found, header = written(tmp_path / "a.exr", layers(crop=True, compression="piz"), volume(), view)
+    whole, _ = written(tmp_path / "b.exr", layers(), volume(), view)
+    (x0, y0), (x1, y1) = (corner.tolist() for corner in header["dataWindow"])
+    assert 0 < x0 < x1 < 59 and 0 < y0 < y1 < 39 and header["compression"] == OpenEXR.PIZ_COMPRESSION
+    for name, plane in whole.items():
+        assert torch.equal(found[name], plane[y0 : y1 + 1, x0 : x1 + 1])
+        plane[y0 : y1 + 1, x0 : x1 + 1] = 0
+        assert not plane.any(), name
+    with pytest.raises(ConfigError, match=r"--crop: without the layer alpha, beauty contains the background"):
+        layers(crop=True, names="beauty,depth")
+
+
 def test_half_is_for_light_and_alpha(tmp_path: Path) -> None:
     found, _ = written(tmp_path / "a.exr", layers(half=True), volume(), VIEW)
     assert {name for name, plane in found.items() if plane.dtype == torch.float32} == {"depth.Z", "density.Y"}

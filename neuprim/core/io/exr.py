@@ -1,4 +1,4 @@
-"""Read and write OpenEXR files with any named channels. Files are written atomically, with lossless ZIP compression.
+"""Read and write OpenEXR files with any named channels. Files are written atomically.
 
 Channels without a prefix are the image (R, G, B and premultiplied A). A prefix and a dot name a layer, e.g.
 ``depth.Z``.
@@ -27,6 +27,14 @@ MAX_PIXELS = 64 * 2**20
 
 _MAX_VALUES = 16 * MAX_PIXELS  # most values of all channels of a file, which are decoded together
 _MAX_HALF = 65504.0
+
+COMPRESSIONS = {
+    "zip": OpenEXR.ZIP_COMPRESSION,
+    "piz": OpenEXR.PIZ_COMPRESSION,
+    "dwaa": OpenEXR.DWAA_COMPRESSION,
+}
+"""Compressions of written files. All are lossless, except dwaa for R, G, B, Y and other colours."""
+
 _MAX_NAME_BYTES = 31  # longest channel name that every reader of OpenEXR accepts
 _MAGIC = b"\x76\x2f\x31\x01"
 
@@ -191,7 +199,11 @@ def write_exr(path: Path, image: Tensor, half: bool = True, names: Sequence[str]
 
 
 def write_exr_layers(
-    path: Path, channels: Mapping[str, ExrChannel], attributes: Mapping[str, Any] | None = None
+    path: Path,
+    channels: Mapping[str, ExrChannel],
+    attributes: Mapping[str, Any] | None = None,
+    compression: str = "zip",
+    visible: Tensor | None = None,
 ) -> None:
     """Write an image of several layers as one OpenEXR file.
 
@@ -199,18 +211,66 @@ def write_exr_layers(
         channels: channel name, with the prefix of its layer -> channel. All channels have the same size. Values of half
             floats are at most 65504.
         attributes: header attributes: text, numbers, float32 arrays of shape (2,), (3,) or (4, 4), lists of floats.
+        compression: name in :data:`COMPRESSIONS`.
+        visible: (H, W) bool; the file stores only the smallest rectangle that contains these pixels, its data window.
+            If there are none, it stores the first pixel. None: store all pixels.
     """
     shapes = sorted({tuple(channel.values.shape) for channel in channels.values()})
     if len(shapes) != 1 or len(shapes[0]) != 2 or 0 in shapes[0]:
         raise DataError(f"{path}: channels to write have shapes {shapes}; expected the same (H, W) for all")
     stored = {name: _exr_values(f"{path}: channel {name}", channel) for name, channel in channels.items()}
-    header = {**(attributes or {}), "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header = {**(attributes or {}), "compression": COMPRESSIONS[compression], "type": OpenEXR.scanlineimage}
+    if visible is not None:
+        (top, bottom), (left, right) = (_first_and_last(visible.any(1 - axis)) for axis in (0, 1))
+        stored = {n: np.ascontiguousarray(v[top : bottom + 1, left : right + 1]) for n, v in stored.items()}
+        height, width = visible.shape
+        for window, corners in (
+            ("dataWindow", ((left, top), (right, bottom))),
+            ("displayWindow", ((0, 0), (width - 1, height - 1))),
+        ):
+            header[window] = tuple(np.array(corner, np.int32) for corner in corners)
+    _write_exr_file(path, header, stored)
+
+
+def write_deep_exr(
+    path: Path,
+    counts: Tensor,
+    samples: Mapping[str, ExrChannel],
+    attributes: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a deep OpenEXR file: any number of samples in each pixel.
+
+    Args:
+        counts: (H, W) int64 numbers of samples.
+        samples: channel name -> channel with (S, 1) values of all samples, row by row of pixels.
+        attributes: header attributes, see :func:`write_exr_layers`.
+    """
+    numbers = counts.flatten()
+    filled, ends = numbers.nonzero()[:, 0].tolist(), numbers.cumsum(0)
+    stored = {}
+    for name, channel in samples.items():
+        parts = np.split(_exr_values(f"{path}: channel {name}", channel)[:, 0], ends[:-1].numpy())
+        pixels = np.empty(len(numbers), dtype=object)  # None where a pixel is empty
+        for i in filled:
+            pixels[i] = parts[i]
+        stored[name] = pixels.reshape(tuple(counts.shape))
+    header = {**(attributes or {}), "compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.deepscanline}
+    _write_exr_file(path, header, stored)
+
+
+def _write_exr_file(path: Path, header: dict[str, Any], stored: dict[str, np.ndarray]) -> None:
     with checked_atomic_path(path) as temporary:
         try:
             with OpenEXR.File(header, stored) as file:
                 file.write(str(temporary))
         except RuntimeError as error:
             raise DataError(f"{path}: cannot be written ({error})") from None
+
+
+def _first_and_last(flags: Tensor) -> tuple[int, int]:
+    """Return the indices of the first and the last True of (N,) ``flags``; 0 and 0 if there is none."""
+    found = flags.nonzero()[:, 0].tolist() or [0]
+    return found[0], found[-1]
 
 
 def _exr_values(where: str, channel: ExrChannel) -> np.ndarray:

@@ -15,7 +15,7 @@ from PIL import Image
 
 from neuprim.core.errors import DataError
 from neuprim.core.io import images
-from neuprim.core.io.exr import ExrChannel, exr_channels, write_exr, write_exr_layers
+from neuprim.core.io.exr import COMPRESSIONS, ExrChannel, exr_channels, write_exr, write_exr_layers
 
 
 def noise(*shape: int) -> np.ndarray:
@@ -253,6 +253,33 @@ def test_exr_layers_keep_names_types_and_attributes(tmp_path: Path) -> None:
     assert header["compression"] == OpenEXR.ZIP_COMPRESSION
     assert exr_channels(tmp_path / "a.exr") == ("B", "G", "R", "depth.Z")
     assert torch.equal(images.read_image(tmp_path / "a.exr"), values[..., :3].half())
+
+
+def test_a_data_window_around_what_is_visible(tmp_path: Path) -> None:
+    values, visible = torch.rand(5, 7), torch.zeros(5, 7, dtype=torch.bool)
+    visible[1, 3] = visible[3, 5] = True
+    write_exr_layers(tmp_path / "a.exr", {"Y": ExrChannel(values)}, visible=visible)
+    write_exr_layers(tmp_path / "empty.exr", {"Y": ExrChannel(values)}, visible=visible & False)
+    for name, (x0, y0, x1, y1) in (("a.exr", (3, 1, 5, 3)), ("empty.exr", (0, 0, 0, 0))):
+        with OpenEXR.File(str(tmp_path / name), separate_channels=True) as file:
+            header, pixels = dict(file.header()), np.array(file.channels()["Y"].pixels)
+        assert [c.tolist() for c in header["dataWindow"]] == [[x0, y0], [x1, y1]]
+        assert [c.tolist() for c in header["displayWindow"]] == [[0, 0], [6, 4]]
+        assert np.array_equal(pixels, values[y0 : y1 + 1, x0 : x1 + 1].numpy())
+
+
+@pytest.mark.parametrize("name", COMPRESSIONS)
+def test_compressions_lose_nothing_but_dwaa(tmp_path: Path, name: str) -> None:
+    ramp = torch.linspace(0, 1, 64).expand(64, 64) + 0.05 * torch.rand(64, 64)
+    channels = {"R": ExrChannel(ramp), "depth.Z": ExrChannel(ramp)}
+    write_exr_layers(tmp_path / "a.exr", channels, compression=name)
+    with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
+        assert file.header()["compression"] == COMPRESSIONS[name]
+        found = {n: np.array(c.pixels) for n, c in file.channels().items()}
+    assert np.array_equal(found["depth.Z"], ramp.numpy())
+    assert (
+        np.array_equal(found["R"], ramp.numpy()) == (name != "dwaa") and np.abs(found["R"] - ramp.numpy()).max() < 0.1
+    )
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,11 @@ OPTIONS = {
     "grid": (None, "voxels along the longest side, 8 to 2048 (default: the source's own voxels, else 128)"),
     "voxel_size": (None, "edge of a voxel in world units, instead of grid"),
     "units": ("auto", "source, world or scene; auto: source where the model was fitted to .vdb files, else world"),
-    "threshold": (None, "values below it are not stored (default: an optical depth of 0.001 along the box)"),
+    "threshold": (
+        None,
+        "values below it are not stored (default: the smallest active value of the source, but at least an optical "
+        "depth of 0.001 along the box)",
+    ),
     "half": (None, "16-bit floats, true or false (default: as in the source)"),
     "name": (None, "name of the grid (default: the source's name in units=source, else density)"),
     "velocity": (False, "also write the grid vel: velocities of the primitives, in world units per frame"),
@@ -63,6 +67,7 @@ OPTIONS = {
     "usd": (False, "also write density.usda, a USD stage that shows the files as a volume"),
     "fps": (None, "frames per second, for usd; with it, vel is in world units per second"),
 }
+_LARGEST_THRESHOLD = 0.01  # of the source's largest value, if the user sets no threshold
 _SLAB_BYTES = 64 * 2**20
 _MOST_VOXELS = 2**34
 
@@ -96,7 +101,12 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
     # of all frames, so that voxels and threshold do not depend on the chosen ones
     box = np.stack([v.numpy() for v in find_export_box(job, [*every, *(f.conditions for f in frames)])])
     threshold = job.number("threshold", 0.0, 1e9)
-    threshold = 1e-3 / float((box[1] - box[0]).max()) * factor if threshold is None else threshold
+    if threshold is None:
+        threshold = 1e-3 / float((box[1] - box[0]).max()) * factor
+        if placement is not None:  # the values of a solid block are no threshold
+            extent = GridExtent.around(placement.extents)
+            smallest = min(extent.smallest, _LARGEST_THRESHOLD * extent.largest)
+            threshold = max(threshold, smallest * placement.sigma_per_unit * factor)
     name = placement.grid if placement is not None and units == "source" else "density"
     name = name if job.options["name"] is None else str(job.options["name"])
     half = source is not None and source.half and units == "source"

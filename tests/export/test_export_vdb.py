@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.io.vdb import VdbGrid, read_grid
+from neuprim.core.io.vdb import VdbGrid, read_grid, write_vdb
 from neuprim.core.volumes.density_grid import density_grid
 from neuprim.core.volumes.density_truth import DENSITY_ERRORS
 from neuprim.export import vdb as exporter
@@ -122,6 +122,24 @@ def test_units_times_and_voxels_can_be_chosen(moving: Path, tmp_path: Path) -> N
     assert values["world"] == pytest.approx(values["scene"] * scale, rel=1e-5)
     one = export_run(moving, "vdb", tmp_path / "one.vdb", ["--time=0.5"])
     assert one.files == (tmp_path / "one.vdb",)
+
+
+@pytest.mark.parametrize(("faint", "expected"), [(0.004, 0.004), (1e-7, None), (None, 0.02)])
+def test_the_threshold_is_that_of_the_source(tmp_path: Path, faint: float | None, expected: float | None) -> None:
+    """But not below what is invisible, and not above a hundredth of the largest value, here 2."""
+    files = marked.write_sequence(tmp_path / "files")
+    if faint is not None:
+        path = files / "block_4.vdb"
+        grid = read_grid(path, "density")
+        grid.values[grid.masks] = np.where(np.arange(grid.masks.sum()) == 0, faint, grid.values[grid.masks])
+        write_vdb(path, [grid])
+    run = marked.dynamic_run(tmp_path / "run", files)
+    invisible = 0.001 / 2 / float(open_run(run).volume().placement.sigma_per_unit)  # type: ignore[union-attr]
+    for path in export_run(run, "vdb", tmp_path / "frames").files:
+        found = read_grid(path, "density")
+        threshold = float(found.metadata["neuprim_threshold"])
+        assert found.range is not None and found.range[0] >= threshold
+        assert threshold == pytest.approx(expected, rel=1e-3) if expected else threshold < 3 * invisible
 
 
 def test_without_the_files_the_header_still_places_it(tmp_path: Path) -> None:

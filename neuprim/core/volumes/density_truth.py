@@ -29,17 +29,20 @@ _MIN_SQUARED_ERROR = 1e-20  # share of the squared peak: 200 dB, so that no numb
 
 
 class GridExtent(NamedTuple):
-    """Largest value and bounding box of the absorbing grid (the grid of extinctions) in one frame."""
+    """Range of values and bounding box of the absorbing grid (the grid of extinctions) in one frame."""
 
+    smallest: float  # smallest active value; 0 if that is negative, or without any
     largest: float  # largest value
     box: np.ndarray | None  # (2, 3) box around the active voxels, world units; None without any
 
     @staticmethod
     def around(extents: Sequence[GridExtent]) -> GridExtent:
-        """Return the extent that covers several frames: the largest value and the common bounding box."""
-        boxes = [extent.box for extent in extents if extent.box is not None]
+        """Return the extent that covers several frames: the range of all values and the common bounding box."""
+        full = [extent for extent in extents if extent.box is not None]
+        boxes = [extent.box for extent in full if extent.box is not None]
         box = np.stack([np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)]) if boxes else None
-        return GridExtent(max((extent.largest for extent in extents), default=0.0), box)
+        smallest = min((extent.smallest for extent in full), default=0.0)
+        return GridExtent(smallest, max((extent.largest for extent in full), default=0.0), box)
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ class DensityGridPlacement:
         grid: name of the absorbing grid, whose values are extinctions.
         exact: whether all extinction comes from the absorbing grid; if False, other grids add to the extinction.
         component: name that models use for the part of the extinction from the absorbing grid.
-        extents: largest value and bounding box of the absorbing grid, for each frame; empty if unknown.
+        extents: range of values and bounding box of the absorbing grid, for each frame; empty if unknown.
     """
 
     scene_from_world: np.ndarray
@@ -85,7 +88,9 @@ class DensityGridPlacement:
             "grid": self.grid,
             "exact": self.exact,
             "component": self.component,
-            "extents": [[one.largest, None if one.box is None else one.box.tolist()] for one in self.extents],
+            "extents": [
+                [one.smallest, one.largest, None if one.box is None else one.box.tolist()] for one in self.extents
+            ],
         }
 
     @staticmethod
@@ -105,8 +110,10 @@ class DensityGridPlacement:
                 bool(record["exact"]),
                 str(record.get("component", "density")),
                 [
-                    GridExtent(float(largest), None if box is None else np.array(box, np.float64).reshape(2, 3))
-                    for largest, box in record.get("extents", ())
+                    GridExtent(
+                        float(low), float(high), None if box is None else np.array(box, np.float64).reshape(2, 3)
+                    )
+                    for low, high, box in record.get("extents", ())
                 ],
             )
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
@@ -117,7 +124,8 @@ class DensityGridPlacement:
             and (matrix[3] == (0, 0, 0, 1)).all()
             and abs(np.linalg.det(matrix)) > 0
             and 0 < placement.sigma_per_unit < np.inf
-            and all(0 <= one.largest < np.inf and (one.box is None or np.isfinite(one.box).all()) for one in extents)
+            and all(0 <= one.smallest <= one.largest < np.inf for one in extents)
+            and all(one.box is None or np.isfinite(one.box).all() for one in extents)
             and all(len(values) == count for values in placement.times.values())
             and len(extents) in (0, count)
         )

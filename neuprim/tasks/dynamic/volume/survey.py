@@ -197,12 +197,13 @@ def survey_volume_frames(
     histograms = {meaning: np.zeros(1 << 15, np.int64) for meaning in (reader.extinction, "flames")}
     for i, frame in enumerate(frames):
         progress("looking through the frames", i / len(frames))
-        extents[frame.number] = GridExtent(0.0, None)
+        extents[frame.number] = GridExtent(0.0, 0.0, None)
         for meaning, grid in reader.read(frame.path).items():
             box = grid.world_bounds()
             if box is None or meaning not in histograms or grid.channels != 1:
                 continue
-            extent = GridExtent(max(grid.range[1], 0.0) if grid.range else 0.0, box)
+            low, high = (max(value, 0.0) for value in grid.range or (0.0, 0.0))
+            extent = GridExtent(low, high, box)
             voxel = min(voxel, float(np.linalg.norm(grid.transform[:3, :3], axis=0).min()))
             histograms[meaning] += _count_vdb_values(grid.active_values())
             if meaning == reader.extinction:

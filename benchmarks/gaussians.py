@@ -1,4 +1,5 @@
-"""How well Gaussians reproduce trained primitives, for each edge and each rule of the ``gaussian-ply`` export.
+"""How well Gaussians reproduce trained primitives, for each edge and each rule of the ``gaussian-ply`` export, and
+after the rounding of ``gaussian-spz``.
 
     python benchmarks/gaussians.py [RUN_DIR ...] [--edges 0 1 2] [--neurons 8 0] [--iterations 600] [--record]
     python benchmarks/gaussians.py --print [--docs]
@@ -37,7 +38,7 @@ def train(folder: Path, neurons: int, edge: int, iterations: int) -> Path:
 
 
 def measure(runs: Sequence[tuple[str, Path]]) -> Record:
-    """PSNR of every run and rule, dB."""
+    """PSNR of every run and rule, dB, and that of the best rule as SPZ; bytes of both files."""
     rows = []
     for name, folder in runs:
         with tempfile.TemporaryDirectory() as target:
@@ -45,15 +46,19 @@ def measure(runs: Sequence[tuple[str, Path]]) -> Record:
                 size: export_run(folder, "gaussian-ply", Path(target) / f"{size}.ply", [f"size={size}"])
                 for size in SIZES
             }
-        rows.append({"model": name} | {size: report.errors["psnr"] for size, report in reports.items()})
+            spz = export_run(folder, "gaussian-spz", Path(target) / "auto.spz")
+            sizes = {"ply_bytes": reports[SIZES[0]].files[0].stat().st_size, "spz_bytes": spz.files[0].stat().st_size}
+        errors = {size: report.errors["psnr"] for size, report in reports.items()}
+        rows.append({"model": name, **errors, "spz": spz.errors["psnr"], **sizes})
     return {"rows": rows}
 
 
 def document(record: Record) -> str:
     """The text between the markers."""
-    table = Table("model", *(f"size={size}" for size in SIZES))
+    table = Table("model", *(f"size={size}" for size in SIZES), "best, as SPZ", "bytes, PLY", "SPZ")
     for row in record["rows"]:
-        table.row(row["model"], *(f"{row[size]:.1f} dB" for size in SIZES))
+        sizes = (f"{row[f'{kind}_bytes']:,}" for kind in ("ply", "spz"))
+        table.row(row["model"], *(f"{row[size]:.2f} dB" for size in (*SIZES, "spz")), *sizes)
     return str(table)
 
 

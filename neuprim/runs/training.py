@@ -47,6 +47,7 @@ from neuprim.runs.fit import (
     train_run_steps,
     use_one_torch_thread_for_run,
 )
+from neuprim.runs.forecast import forecast_training, has_forecast
 from neuprim.runs.kernel_compiler import KernelCompiler
 from neuprim.runs.launch.jobs import interruptible_run
 from neuprim.runs.measure import render_image
@@ -111,6 +112,11 @@ def train_in_directory(
         RankError: another rank ended. The first rank, if it still runs, has saved a checkpoint of the last whole step.
     """
     compiler = KernelCompiler(config) if group is None else None
+    wanted = compiler is not None and make is None and dataset is None and has_forecast(config)
+    forecast, size = None, config.scene.get("size")  # of images that neuprim renders; others are read in no time
+    if wanted and isinstance(size, int) and compiler is not None and compiler.ready:
+        forecast = forecast_training(config, size, size)
+        events(Note(forecast.describe(config)))
     with nullcontext() if group is None else group.in_turn():
         fitted = prepare_training(config, events, dataset, hold_out, make, group)
         trainer = fitted.trainer
@@ -125,6 +131,10 @@ def train_in_directory(
         compile_run_kernels(trainer, events)
         if compiler is not None:
             compiler.finish()
+        if wanted:
+            camera = fitted.dataset.train.view(0).camera
+            forecast = forecast or forecast_training(fitted.config, camera.width, camera.height)
+            events(Note(forecast.describe(config, len(fitted.dataset.test))))
     if isinstance(trainer, DistributedTrainer):
         trainer.check_same_start()
     return fitted, _train_and_save(fitted, events, between) if trainer.rank == 0 else _train_run_as_follower(trainer)

@@ -131,10 +131,12 @@ class PointCloud:
     alphas: Tensor | None = None  # (N,) opacities 0..1 at the centres
     deviations: Tensor | None = None  # (N, 3) standard deviations of Gaussians, instead of axes
     steps: Mapping[str, float] = field(default_factory=dict)  # condition, e.g. "time" -> its step from frame to frame
+    velocities: Tensor | None = None  # (N, 3) scene units per unit of the condition "time"
 
     def rows(self, index: Tensor) -> PointCloud:
         """Return the points that ``index`` selects: (M,) int64 row numbers, or an (N,) bool mask."""
-        values = {name: getattr(self, name) for name in ("means", "colors", "axes", "quats", "alphas", "deviations")}
+        names = ("means", "colors", "axes", "quats", "alphas", "deviations", "velocities")
+        values = {name: getattr(self, name) for name in names}
         chosen = {name: value[index] for name, value in values.items() if value is not None}
         return replace(self, **chosen, conditions={n: value[index] for n, value in self.conditions.items()})
 

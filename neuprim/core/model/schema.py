@@ -40,6 +40,7 @@ class InitContext:
         quats: (N, 4) wxyz orientations of starting points that are ellipsoids.
         alphas: (N,) opacities 0..1 of the starting points along a ray through their centres, if known.
         steps: condition name -> difference between the condition's values in neighbouring frames of a sequence.
+        velocities: (N, 3) velocities of the starting points, scene units per unit of the condition "time", if known.
     """
 
     means: Tensor
@@ -52,6 +53,7 @@ class InitContext:
     quats: Tensor | None = None
     alphas: Tensor | None = None
     steps: Mapping[str, float] = field(default_factory=dict)
+    velocities: Tensor | None = None
 
     @property
     def thickness(self) -> Tensor:

@@ -74,6 +74,7 @@ def initial_model_to_train(
     context = InitContext(
         cloud.means.float(), scales, cloud.colors.float(), generator, settings.init, cloud.conditions, steps=cloud.steps
     )
+    context.velocities = cloud.velocities
     factor = context.number("scale", 1.0, 0)
     context.scales, context.quats, context.alphas = scales * factor, cloud.quats, cloud.alphas
     axes = cloud.axes

@@ -159,7 +159,11 @@ class TimeDensity(DensityField):
             specs.append(ParameterSpec("window_center", (1,), 3e-3, _initial_time_window_center))
             specs.append(ParameterSpec("log_window", (1,), 1e-2, _initial_log_time_window))
         if "motion" in self.parts:
-            specs += [ParameterSpec(name, (3,), 1e-2, _zero_time_parameters(3), lr_unit="extent") for name in _MOTION]
+            starts = (_initial_velocity, _zero_time_parameters(3))
+            specs += [
+                ParameterSpec(name, (3,), 1e-2, start, lr_unit="extent")
+                for name, start in zip(_MOTION, starts, strict=True)
+            ]
         if self.seams:
             specs.append(ParameterSpec("chunk", (1,), 0.0, _zero_time_parameters(1)))
         specs += [ParameterSpec(_SHARE + name, (1,), 0.3, _zero_time_parameters(1)) for name in self.named]
@@ -312,6 +316,10 @@ def _advance_phase_in_time(b1: Tensor, W_t: Tensor, xi: Tensor, turn: float) -> 
 
 def _zero_time_parameters(width: int) -> Any:
     return lambda ctx: torch.zeros(ctx.count, width)
+
+
+def _initial_velocity(ctx: InitContext) -> Tensor:
+    return torch.zeros(ctx.count, 3) if ctx.velocities is None else ctx.velocities.float()
 
 
 def _initial_time_window_center(ctx: InitContext) -> Tensor:

@@ -33,8 +33,9 @@ from neuprim.core.volumes.density_truth import (
     DensityGridPlacement,
     GridExtent,
 )
-from neuprim.tasks.dynamic.volume.lit_medium import LitMedium, build_medium, draw_lights, sample_vdb_grid
+from neuprim.tasks.dynamic.volume.lit_medium import LitMedium, build_medium, draw_lights, vdb_grid_sampler
 from neuprim.tasks.dynamic.volume.medium import Medium
+from neuprim.tasks.dynamic.volume.motion import VelocityGrid
 from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Light, Optics
 from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation, GridReader
 
@@ -66,6 +67,7 @@ class Capture:
         ends: numbers of the frames with time 0 and 1; None for the first and the last frame.
         measured: frame number -> extent of its extinction grid; empty if unknown.
         channels: names of the grids that models learn besides the look -> range of their values.
+        velocity: name of the grid of velocities with which primitives start; None if there is none.
     """
 
     frames: Sequence[VdbFrame]
@@ -80,6 +82,7 @@ class Capture:
     ends: tuple[int, int] | None = None
     measured: Mapping[int, GridExtent] = field(default_factory=dict)
     channels: Mapping[str, ChannelRange] = field(default_factory=dict)
+    velocity: str | None = None
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -145,10 +148,17 @@ class Capture:
         found = {name: np.zeros((len(points), own.width), np.float32) for name, own in self.channels.items()}
         for grid in read_grids(frame.path, [name for name in self.channels if name in stored]):
             try:
-                found[grid.name] = sample_vdb_grid(grid, world)
+                found[grid.name] = vdb_grid_sampler(grid)(world)
             except DataError as error:
                 raise DataError(f"{frame.path}: {error}") from error
         return found
+
+    def read_velocities(self, grid: VelocityGrid, frame: VdbFrame, points: torch.Tensor) -> torch.Tensor:
+        """Return (M, 3) float32 velocities of a frame at ``points`` (M, 3), scene units per unit of time."""
+        matrix, (first, last) = self.normalisation.matrix(), self.clock
+        back = np.linalg.inv(matrix)
+        world = points.double().numpy() @ back[:3, :3].T + back[:3, 3]
+        return torch.from_numpy(grid.sample(frame, world) @ matrix[:3, :3].T * max(last - first, 1)).float()
 
     def placement(self) -> DensityGridPlacement:
         """Return the scene's position in the world of its .vdb files, with frame numbers, times and grid names."""

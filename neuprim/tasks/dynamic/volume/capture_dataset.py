@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.capture_voxels import FrameVoxels, RecentFrames
+from neuprim.tasks.dynamic.volume.motion import measure_velocity_grid
 from neuprim.tasks.dynamic.volume.optics import Light
 
 TRAINING_MEMORY, _TEST_MEMORY, _VOXEL_MEMORY = 6 / 11, 1 / 11, 4 / 11
@@ -140,7 +141,8 @@ class VolumeRecording:
             )
         frames = torch.multinomial(torch.from_numpy(weights), count, replacement=True, generator=generator)
         per_frame = torch.bincount(frames, minlength=len(weights)).tolist()
-        means, colors, times = [], [], []
+        means, colors, times, velocities = [], [], [], []
+        moving = measure_velocity_grid(self.capture.frames, self.capture.reader, self.capture.velocity)
         for t in np.flatnonzero(per_frame).tolist():
             wanted = per_frame[t]
             stored = read_vdb_frame_points(
@@ -156,9 +158,12 @@ class VolumeRecording:
             means.append(positions)
             colors.append(torch.from_numpy(stored["colors"])[rows] / self.exposure)
             times.append(torch.full((wanted,), float(self.test.times[t])))
+            if moving is not None:
+                velocities.append(self.capture.read_velocities(moving, self.capture.frames[t], positions))
         intervals = np.diff([float(time) for time in self.test.times][:: self.every])
         steps = {"time": float(np.median(intervals))} if len(intervals) else {}
-        return PointCloud(torch.cat(means), torch.cat(colors), {"time": torch.cat(times)}, steps=steps)
+        cloud = PointCloud(torch.cat(means), torch.cat(colors), {"time": torch.cat(times)}, steps=steps)
+        return replace(cloud, velocities=torch.cat(velocities)) if velocities else cloud
 
     def matter_mask(self, index: int) -> Tensor:
         """Return (H, W) bool: pixels that smoke or fire covers in any frame of the camera of test view ``index``."""

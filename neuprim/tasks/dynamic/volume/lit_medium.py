@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -227,23 +227,27 @@ class _MediumGrid:
         return found
 
 
-def sample_vdb_grid(grid: VdbGrid, points: np.ndarray) -> np.ndarray:
-    """Return the (M, C) float32 values of a grid at ``points`` (M, 3), world coordinates, trilinear between voxels.
+def vdb_grid_sampler(grid: VdbGrid) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function (points (M, 3), world coordinates) -> (M, C) float32 values of a grid.
 
-    Values are 0 outside the grid's voxels, and where they are not finite. In a staggered grid, component a of a voxel
-    is the value half a voxel before the voxel's centre along axis a.
+    Values are trilinear between voxels, and 0 outside the grid's voxels and where they are not finite. In a staggered
+    grid, component a of a voxel is the value half a voxel before the voxel's centre along axis a.
     """
     if grid.bounds is None:
-        return np.zeros((len(points), grid.channels), np.float32)
+        return lambda points: np.zeros((len(points), grid.channels), np.float32)
     own = _MediumGrid.in_bricks([grid], grid.transform, grid.bounds)
     values = read_bricks(grid, own.first, own.bricks)
     values = values.reshape(*values.shape[:4], grid.channels)
     values[~np.isfinite(values)] = 0.0
-    back = np.linalg.inv(grid.transform)
-    index = points @ back[:3, :3].T + back[:3, 3] - own.first
+    back, channels = np.linalg.inv(grid.transform), range(grid.channels)
     shifts = 0.5 * np.eye(3) if grid.kind == "staggered" else np.zeros((grid.channels, 3))
-    found = [own.bricks.sample(np.ascontiguousarray(values[..., c]), index + shifts[c]) for c in range(grid.channels)]
-    return np.stack(found, -1)
+    parts = [np.ascontiguousarray(values[..., c]) for c in channels]
+
+    def sample(points: np.ndarray) -> np.ndarray:
+        index = points @ back[:3, :3].T + back[:3, 3] - own.first
+        return np.stack([own.bricks.sample(parts[c], index + shifts[c]) for c in channels], -1)
+
+    return sample
 
 
 def _transform_boxes(boxes: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:

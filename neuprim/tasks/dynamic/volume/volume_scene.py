@@ -43,6 +43,7 @@ from neuprim.tasks.dynamic.volume.capture_dataset import (
     volume_dataset,
 )
 from neuprim.tasks.dynamic.volume.capture_density import CaptureDensity
+from neuprim.tasks.dynamic.volume.motion import find_velocity_grid
 from neuprim.tasks.dynamic.volume.optics import (
     DATA_DEPENDENT,
     UP_AXES,
@@ -98,6 +99,7 @@ class VdbSceneSettings:
         grids: meaning ("density", "flames", ...) -> name of the grid in the files.
         channels: names of grids in the files whose values the model also learns, e.g. the temperature or the velocity,
             to export them again.
+        velocity: name of the grid of velocities with which primitives start; "auto" for a usual name; "none": at rest.
         look: name of a preset of the optics, or "auto".
         optics: changes to the preset's settings.
         size: width and height of the images in pixels.
@@ -122,6 +124,7 @@ class VdbSceneSettings:
     chunks: Annotated[int, Range(1, 1000)] | Literal["auto"] | None = None
     grids: Mapping[GridMeaning, Annotated[str, nonempty_text("the name of a grid")]] = field(default_factory=dict)
     channels: tuple[Channel, ...] = ()
+    velocity: Annotated[str, nonempty_text("the name of a grid, auto or none")] = "auto"
     look: str = "auto"
     optics: Mapping[str, Any] = field(default_factory=dict)
     size: Annotated[int, Range(8, 4096)] = 160
@@ -265,6 +268,7 @@ def _prepare_vdb_scene(
     reader = reader.with_extinction(optics.extinction_grids, folder)
     measured: Mapping[int, GridExtent] = {}
     channels: Mapping[str, ChannelRange] = {}
+    velocity = find_velocity_grid(frames, options.velocity)
     train, test = hemisphere_capture_cameras(
         options.size, options.cameras, up=options.up, field_of_view=options.field_of_view
     )
@@ -294,8 +298,9 @@ def _prepare_vdb_scene(
         raise ConfigError(f"{found}; add scene.optics.light={{direction: [x, y, z], irradiance: [r, g, b]}}")
     lights = (options.lights, len(test))
     capture = Capture(
-        frames, reader, optics, *views, normalisation, bounds, *lights, measured=measured, channels=channels
-    )
+        frames, reader, optics, *views, normalisation, bounds, *lights, measured=measured, channels=channels,
+        velocity=velocity,
+    )  # fmt: skip
     source: DataSource = "simulated" if options.vdb is None else "real"
     return _PreparedVdbScene(options, name, source, capture, range(len(train), len(train) + len(test)))
 

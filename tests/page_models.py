@@ -68,7 +68,8 @@ def page_of(
     **more: Any,
 ) -> WebPage:
     """A page with one view, written to ``path``."""
-    given = [Condition(_SPECS[name], value) for name, value in (conditions or {}).items()]
+    frames = more.pop("frames", None)
+    given = [Condition(_SPECS[name], value, frames) for name, value in (conditions or {}).items()]
     views = more.pop("views", [PageView("first", camera_at((0.3, -3.0, 1.0)), conditions or {})])
     name, level = more.pop("name", "model"), more.pop("level", 0)
     page = make_model_webpage(name, model, (0, 1, 2), settings, PageScene(conditions=given, views=views, **more), level)

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
+from neuprim.core.conditions import source_frames
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, TrainedModel
 from neuprim.core.io.files import write_text
@@ -44,6 +45,7 @@ OPTIONS = {
         1,
         "digits of the model's numbers: 0 for all, or a level of `neuprim compress`, 1 (nearly all) to 5 (very few)",
     ),
+    "fps": (None, "frames per second at which the page plays a sequence (default: six seconds for all frames)"),
     "views": (6, "held-out cameras to jump to, with their true images, 0 to 100"),
 }
 _MEASURED_VIEWS = 4
@@ -58,7 +60,11 @@ def _write_html_export(job: ExportJob) -> ExportReport:
     find_export_rgb_channels(run)
     level, limit = job.count("level", 0, 5) or 0, job.count("views", 0, 100) or 0
     views, notes = _load_html_export_views(job, limit)
-    conditions = initial_webpage_conditions(run.task.conditions, views, job.frames()[0] if job.conditions else {})
+    frames, fps = source_frames(run.header), job.number("fps", 0.1, 240.0)
+    if fps is not None and frames is None:
+        raise ConfigError("fps: the model has no numbered frames; expected a model of .vdb files. Omit fps.")
+    given = job.frames()[0] if job.conditions else {}
+    conditions = initial_webpage_conditions(run.task.conditions, views, given, frames, fps)
     scene = PageScene(
         webpage_subtitle(run.task.name, str(run.header.get("data_source", "real"))),
         run.header["background"],

@@ -65,7 +65,7 @@ OPTIONS = {
     "emission": (False, "also write the grid emission: extinction times emitted colour, linear RGB"),
     "albedo": (False, "also write the grid albedo, of models trained with scene.lights=4"),
     "usd": (False, "also write density.usda, a USD stage that shows the files as a volume"),
-    "fps": (None, "frames per second, for usd; with it, vel is in world units per second"),
+    "fps": (None, "frames per second, for usd and the files' metadata; with it, vel is in world units per second"),
 }
 _LARGEST_THRESHOLD = 0.01  # of the source's largest value, if the user sets no threshold
 _SLAB_BYTES = 64 * 2**20
@@ -121,8 +121,9 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
     moving = choose_velocity(job, sampler.model, [f.conditions for f in frames], scene_from_world)
     look = choose_look(job, frames[0].conditions, per_world, scene_from_world)
     whole = sampler._replace(model=job.run.model)
-    names, boxes = list[str](), list[np.ndarray]()
+    names, boxes, rate = list[str](), list[np.ndarray](), job.number("fps", 0.1, 240.0)
     metadata = {"neuprim_units": units, "neuprim_sigma_per_unit": 1 / factor, "neuprim_threshold": threshold}
+    metadata |= {} if rate is None else {"neuprim_fps": rate}
     errors: dict[str, float] = {}
     for i, (frame, path) in enumerate(zip(frames, paths, strict=True)):
         job.progress("writing frames", i / len(frames))
@@ -178,7 +179,7 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
         files = {frame.number: path for frame, path in zip(frames, paths, strict=True)}
         up = torch.from_numpy(scene_from_world[:3, :3].T) @ job.run.world.up
         stage = job.out / "density.usda"
-        write_usd_volume(stage, files, names, boxes, up, job.number("fps", 0.1, 240.0))
+        write_usd_volume(stage, files, names, boxes, up, rate)
         paths.append(stage)
     return ExportReport(tuple(paths), False, errors, tuple(notes))
 

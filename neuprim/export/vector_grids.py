@@ -228,8 +228,6 @@ def choose_velocity(
     """
     rate = job.number("fps", 0.1, 240.0)
     if not job.flag("velocity"):
-        if rate is not None and not job.flag("usd"):
-            raise ConfigError("fps: used only with velocity=true or usd=true; pass one of them, or leave out fps")
         return None
     active = model.active(frames[0])
     if "time" not in frames[0] or active.geometry is active.stored:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
+from neuprim.core.conditions import source_frames
 from neuprim.core.data import Clip, View
 from neuprim.core.errors import CheckpointError, FormError
 from neuprim.core.io import images
@@ -16,7 +17,7 @@ from neuprim.core.io.files import write_json
 from neuprim.core.io.images import FrameSpool, write_animation
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
-from neuprim.plugins.attribution import call_task_clips, call_task_orbit
+from neuprim.plugins.attribution import call_task_clips, call_task_facts, call_task_orbit
 from neuprim.report.pictures import WorstRegions, error_map
 from neuprim.report.run_record import median_and_worst
 from neuprim.report.run_report import Viewer, write_report
@@ -109,11 +110,12 @@ def _make_run_viewer_page(fitted: Fitted, directory: Path) -> Viewer | None:
 
     # without images: the report shows them beside the model
     views = held_out_webpage_views(dataset, channels, _SHOWN_VIEWS, truths=False)
+    frames = source_frames({"data": call_task_facts(task, dataset)})
     scene = PageScene(
         webpage_subtitle(task.name, dataset.data_source),
         dataset.background.tolist(),
         up=dataset.up.tolist(),
-        conditions=initial_webpage_conditions(task.conditions, views, {}),
+        conditions=initial_webpage_conditions(task.conditions, views, {}, frames),
         views=views,
     )
     try:

@@ -53,6 +53,8 @@ class Condition(NamedTuple):
 
     spec: ConditionSpec
     value: Tensor
+    frames: tuple[int, int] | None = None  # numbers of the frames at both ends of the range, shown instead of the value
+    fps: float | None = None  # frames per second at which the page plays; None for six seconds
 
 
 @dataclass(frozen=True)
@@ -207,18 +209,24 @@ def held_out_webpage_views(dataset: Dataset, channels: Channels, limit: int, tru
 
 
 def initial_webpage_conditions(
-    specs: Sequence[ConditionSpec], views: Sequence[PageView], given: Mapping[str, Tensor]
+    specs: Sequence[ConditionSpec],
+    views: Sequence[PageView],
+    given: Mapping[str, Tensor],
+    frames: tuple[int, int] | None = None,
+    fps: float | None = None,
 ) -> list[Condition]:
     """Return the initial value of each condition, float64.
 
-    The value is that in ``given``, else that of the first view, else the middle of a bounded range, else 1.
+    The value is that in ``given``, else that of the first view, else the middle of a bounded range, else 1. ``frames``
+    and ``fps`` are those of the condition "time".
     """
     shown = {**(views[0].conditions if views else {}), **given}
     found = []
     for spec in specs:
         low, high = spec.range
         middle = torch.full(spec.shape, 0.5 * (low + high) if high - low < 1e4 else 1.0)
-        found.append(Condition(spec, shown.get(spec.name, middle).double()))
+        played = (frames, fps) if spec.name == "time" else (None, None)
+        found.append(Condition(spec, shown.get(spec.name, middle).double(), *played))
     return found
 
 
@@ -336,8 +344,11 @@ def _condition_json(condition: Condition) -> dict[str, Any]:
     if spec.shape == () and high - low > _MAX_SLIDER_RANGE:
         low, high = float(condition.value) - 1.0, float(condition.value) + 1.0
     place = spec.shape == (3,) and spec.unit.startswith("position")
-    value = condition.value.double().tolist()
-    return {"name": spec.name, "value": value, "range": [low, high], "place": place, "period": _SWEEP_SECONDS}
+    value, frames, period = condition.value.double().tolist(), condition.frames, _SWEEP_SECONDS
+    if frames is not None and condition.fps is not None:
+        period = max(frames[1] - frames[0], 1) / condition.fps
+    found = {"name": spec.name, "value": value, "range": [low, high], "place": place, "period": period}
+    return found if frames is None else {**found, "frames": list(frames)}
 
 
 # ---------------------------------------------------------------- constants of the shaders

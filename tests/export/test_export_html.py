@@ -51,6 +51,17 @@ def test_a_page_begins_where_something_is_to_be_seen(tmp_path: Path) -> None:
     assert len(views) == 4 and max(picked[view.name] for view in views) == pytest.approx(picked[views[0].name], rel=0.2)
 
 
+def test_a_sequence_plays_its_frames_at_a_rate(tmp_path: Path) -> None:
+    run = marked.dynamic_run(tmp_path / "run", tmp_path / "no files", data={"frames": [1001, 1049]})
+    for more, period in (([], 6.0), (["fps=24"], 2.0)):
+        path = export_run(run, "html", tmp_path / f"{period}.html", ["views=0", "--time=0.5", *more]).files[0]
+        (time,) = header_of(path.read_text(encoding="utf-8"))["conditions"]
+        assert time["frames"] == [1001, 1049] and time["period"] == period
+    plain = marked.dynamic_run(tmp_path / "plain", tmp_path / "no files")
+    with pytest.raises(ConfigError, match="fps: the model has no numbered frames"):
+        export_run(plain, "html", tmp_path / "plain.html", ["views=0", "--time=0.5", "fps=24"])
+
+
 @pytest.mark.parametrize("start", [0.1, 0.9])
 @pytest.mark.parametrize("active", ["late", "never", "no primitive"])
 def test_a_page_of_what_is_not_active(active: str, start: float, tmp_path: Path) -> None:

@@ -140,6 +140,7 @@ def test_a_frame_rate_makes_them_velocities_per_second(tmp_path: Path) -> None:
     assert np.allclose(second.values, 24 * frame.values, rtol=1e-5)
     assert frame.metadata["neuprim_units"] == "world units per frame"
     assert second.metadata["neuprim_units"] == "world units per second"
+    assert read_grid(tmp_path / "b.vdb", "density").metadata["neuprim_fps"] == 24.0
 
 
 def test_the_grid_is_a_vector_grid_of_openvdb(tmp_path: Path) -> None:
@@ -166,7 +167,6 @@ def test_an_empty_frame_has_an_empty_grid(tmp_path: Path) -> None:
     ("words", "message"),
     [
         (["velocity=true"], "velocity=true: the primitives of this model do not move; expected a model with motion"),
-        (["fps=24"], "fps: used only with velocity=true or usd=true; pass one of them, or leave out fps"),
     ],
 )
 def test_wrong_options_are_refused(tmp_path: Path, words: list[str], message: str) -> None:

@@ -181,6 +181,15 @@ def test_time_moves_and_plays(chromium: Any, tmp_path: Path) -> None:
         assert tab.page.inner_text("#conditions output") == held and tab.faults == []
 
 
+def test_time_is_shown_as_a_frame_number(chromium: Any, tmp_path: Path) -> None:
+    model = random_model(TimeDensity(2, "window", edge=2), TimeHarmonics(1), count=20)
+    page_of(model, tmp_path / "p.html", {"time": torch.tensor(0.25)}, frames=(1001, 1049))
+    with open_tab(chromium, tmp_path / "p.html") as tab:
+        assert tab.page.inner_text("#conditions output") == "frame 1013"
+        slide(tab, "#conditions input[type=range]", 1.0)
+        assert tab.page.inner_text("#conditions output") == "frame 1049"
+
+
 def test_light_and_shadows_move(chromium: Any, tmp_path: Path) -> None:
     page_of(random_model(CosineDensity(2, edge=2), LightNetwork(6), count=80), tmp_path / "p.html", LIGHT)
     with open_tab(chromium, tmp_path / "p.html") as tab:

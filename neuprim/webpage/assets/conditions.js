@@ -7,7 +7,7 @@ function controls(page, into, changed) {
     return element;
   };
 
-  function slider({ name, range, value, period }) {
+  function slider({ name, range, value, period, frames }) {
     const [low, high] = range, out = make("output", {});
     const bar = make("input", { type: "range", min: low, max: high, step: (high - low) / 1000, ariaLabel: name });
     const play = make("button", { textContent: "▶", title: `play ${name}`, ariaLabel: `play ${name}` });
@@ -15,7 +15,8 @@ function controls(page, into, changed) {
     const set = x => {
       values[name] = x;
       bar.value = x;
-      out.textContent = x.toFixed(2);
+      const part = (x - low) / (high - low);
+      out.textContent = frames ? `frame ${Math.round(frames[0] + part * (frames[1] - frames[0]))}` : x.toFixed(2);
     };
     const step = now => {
       if (since === null) return;

@@ -11,6 +11,7 @@ from neuprim.config import Job, RunConfig
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.data import Dataset, Pixels, PointCloud, PointSamples, View, ViewSet
 from neuprim.core.data.dataset import PointSupervision
+from neuprim.core.errors import NeuprimError
 from neuprim.core.metrics import psnr, ssim
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.plugins.registry import TASKS
@@ -51,12 +52,19 @@ def has_forecast(config: RunConfig) -> bool:
     return own and long and config.model.primitives != "auto" and not config.resume
 
 
-def forecast_training(config: RunConfig, width: int, height: int) -> Forecast:
+def forecast_training(config: RunConfig, width: int, height: int) -> Forecast | None:
     """Train for a few steps on noise images of the given size, and return the forecast.
 
-    The steps have the settings of the middle of the run. The kernels must be compiled. Raises ConfigError as the run
-    would.
+    The steps have the settings of the middle of the run. The kernels must be compiled. Return None if the trial raises
+    NeuprimError: noise does not suit the settings, or they are wrong, which the run itself reports.
     """
+    try:
+        return _time_steps_on_noise(config, width, height)
+    except NeuprimError:
+        return None
+
+
+def _time_steps_on_noise(config: RunConfig, width: int, height: int) -> Forecast:
     job = Job.of(config)
     whole = replace(config.train, population=replace(config.train.population, grow_from=1.0))
     trial = Job(replace(config, train=whole), job.task)
@@ -85,14 +93,14 @@ def forecast_training(config: RunConfig, width: int, height: int) -> Forecast:
 class _NoiseViews(ViewSet):
     """Two views. Their images are noise, and their cameras are about 3 units from the origin."""
 
-    def __init__(self, size: tuple[int, int], channels: int, conditions: dict[str, torch.Tensor]) -> None:
+    def __init__(self, size: tuple[int, int], channels: int, conditions: dict[str, torch.Tensor], opaque: bool) -> None:
         eyes = [torch.tensor([3.0, 0.0, 0.5]), torch.tensor([0.0, 3.0, 0.5])]
         up, middle = torch.tensor([0.0, 0.0, 1.0]), torch.zeros(3)
         width, height = size
         lens = (width, width, width / 2, height / 2, width, height)
         cameras = [Camera(look_at(eye, middle, up), *lens) for eye in eyes]
         self._views = [View(f"noise {i}", camera, conditions) for i, camera in enumerate(cameras)]
-        self._pixels = Pixels(torch.rand(height, width, channels), torch.ones(height, width))
+        self._pixels = Pixels(torch.rand(height, width, channels), None if opaque else torch.ones(height, width))
 
     def __len__(self) -> int:
         return len(self._views)
@@ -127,7 +135,8 @@ def noise_dataset(job: Job, width: int, height: int, points: int) -> Dataset:
         spec.name: torch.full(spec.shape, sum(spec.range) / 2 + (3.0 if spec.shape else 0.0), dtype=torch.float64)
         for spec in conditions
     }
-    views = _NoiseViews((width, height), channels, values)
+    opaque = job.config.train.exposure_rate > 0  # learned exposures need photographs
+    views = _NoiseViews((width, height), channels, values, opaque)
 
     def start(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
         means = torch.rand(count, 3, generator=generator) - 0.5

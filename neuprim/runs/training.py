@@ -115,8 +115,8 @@ def train_in_directory(
     wanted = compiler is not None and make is None and dataset is None and has_forecast(config)
     forecast, size = None, config.scene.get("size")  # of images that neuprim renders; others are read in no time
     if wanted and isinstance(size, int) and compiler is not None and compiler.ready:
-        forecast = forecast_training(config, size, size)
-        events(Note(forecast.describe(config)))
+        if (forecast := forecast_training(config, size, size)) is not None:
+            events(Note(forecast.describe(config)))
     with nullcontext() if group is None else group.in_turn():
         fitted = prepare_training(config, events, dataset, hold_out, make, group)
         trainer = fitted.trainer
@@ -134,7 +134,8 @@ def train_in_directory(
         if wanted:
             camera = fitted.dataset.train.view(0).camera
             forecast = forecast or forecast_training(fitted.config, camera.width, camera.height)
-            events(Note(forecast.describe(config, len(fitted.dataset.test))))
+            if forecast is not None:
+                events(Note(forecast.describe(config, len(fitted.dataset.test))))
     if isinstance(trainer, DistributedTrainer):
         trainer.check_same_start()
     return fitted, _train_and_save(fitted, events, between) if trainer.rank == 0 else _train_run_as_follower(trainer)

@@ -40,11 +40,13 @@ def test_what_it_says() -> None:
 @pytest.mark.parametrize("limits", [["train.max_seconds=0.001"], ["train.iterations=null", "train.max_seconds=33"]])
 def test_a_budget_in_seconds_is_kept(limits: list[str]) -> None:
     config = compose([*SMALL, *limits])
-    assert forecast_training(config, 24, 24).training == config.train.max_seconds
+    found = forecast_training(config, 24, 24)
+    assert found is not None and found.training == config.train.max_seconds
 
 
 @pytest.mark.parametrize(
-    "words", [SMALL, ["task=dynamic", "scene=smoke_fire", "model.primitives=50", "scene.lights=4"],
+    "words", [SMALL, [*SMALL, "train.exposure_rate=1e-3"],
+              ["task=dynamic", "scene=smoke_fire", "model.primitives=50", "scene.lights=4"],
               ["task=relight", "scene=lit_solids", "model.primitives=50"]],
 )  # fmt: skip
 def test_the_trial_has_the_settings_of_the_middle(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -61,7 +63,11 @@ def test_the_trial_has_the_settings_of_the_middle(words: list[str], monkeypatch:
     found = forecast_training(config, 24, 16)
     assert torch.equal(torch.random.get_rng_state(), state)
     assert taken[0][0] == (config.train.iterations or 0) // 2 and taken[0][1] == config.model.count
-    assert 4 < len(taken) <= 43 and found.view > 0 and found.training > 0
+    assert 4 < len(taken) <= 43 and found is not None and found.view > 0 and found.training > 0
+
+
+def test_settings_that_noise_does_not_suit_have_none() -> None:
+    assert forecast_training(compose([*SMALL, "model.init.points=nothing.ply"]), 24, 24) is None
 
 
 @pytest.mark.parametrize("ready", [True, False])

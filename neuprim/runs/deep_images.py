@@ -63,22 +63,25 @@ def draw_deep_image(
     pixels, samples = list[Tensor](), list[Tensor]()
     with torch.no_grad():
         frames = [model.lower(view.camera, {**view.conditions, **light}, settings) for light in lights or ({},)]
-        for frame in frames:
-            on_alpha(render_lowered(frame, view.camera, settings).alpha)
+        transmittance = torch.ones(view.camera.height, view.camera.width)
         members, edges = _slice_by_depth(frames[0], view.camera, settings, most, scale)
         for i, rows in enumerate(members):
             weights = torch.zeros(frames[0].geometry.count, device=rows.device).index_fill(0, rows, 1.0)
             slices = [replace(frame, density=frame.density.scaled(weights)) for frame in frames]
             drawn = [render_lowered(part, view.camera, replace(settings, depth=True)) for part in slices]
             rgb = torch.stack([image.rgb.cpu().double() for image in drawn]).sum(0)
-            alpha, middle = drawn[0].alpha.cpu().flatten(), drawn[0].depth
+            alpha, middle = drawn[0].alpha.cpu(), drawn[0].depth
             assert middle is not None
+            transmittance = transmittance * (1 - alpha)
+            alpha = alpha.flatten()
             seen = (alpha > 0).nonzero()[:, 0]
             first, last = torch.nextafter(edges[i], torch.tensor(torch.inf)), edges[i + 1]  # no end twice
             middle = (middle.cpu().double().flatten()[seen] / scale).float().clamp(first, last)
             ends = torch.stack([(2 * middle - last).clamp_min(first), (2 * middle - first).clamp_max(last)], 1)
             pixels.append(seen)
             samples.append(torch.cat([rgb.flatten(0, 1)[seen], alpha[seen, None].double(), ends.double()], 1))
+    for _ in frames:
+        on_alpha(1 - transmittance)
     height, width = view.camera.height, view.camera.width
     of_pixel = torch.cat([torch.zeros(0, dtype=torch.int64), *pixels])
     order = of_pixel.argsort(stable=True)

@@ -18,7 +18,7 @@ from neuprim.plugins.registry import TASKS
 from neuprim.runs.fit import make_run_loss, make_run_trainer, use_one_torch_thread_for_run
 from neuprim.runs.measure import render_image
 
-_LEAST_STEPS = 500  # of a training that is worth a forecast
+_LEAST_STEPS = 500  # a shorter training has no forecast
 _WARM, _STEPS, _SECONDS, _POINTS = 3, 40, 2.0, 4096  # of the trial: steps before the clock starts, limits, voxels
 
 
@@ -26,7 +26,7 @@ _WARM, _STEPS, _SECONDS, _POINTS = 3, 40, 2.0, 4096  # of the trial: steps befor
 class Forecast:
     """Estimated durations in seconds, on this machine as busy as it is now: of the training, and of one held-out view.
 
-    Durations of whole runs were 1 to 1.5 times the forecast, and 3 times that of the short preset ``preview``.
+    Early steps may be slower than the steps of the middle, which are timed, and population control takes time.
     """
 
     training: float

@@ -40,7 +40,7 @@ class KernelCompiler:
         self._marker = _marker(config.task)
         self._process: subprocess.Popen[bytes] | None = None
         own = any(info.built_in and info.name == config.task for info in TASKS.list_plugins())
-        if not own or self._marker.exists() or core_count() < 2 or device.cuda_unavailable() is None:
+        if not own or self.ready or core_count() < 2 or device.cuda_unavailable() is None:
             return
         command = [sys.executable, "-m", "neuprim.runs.kernel_compiler"]
         quiet = subprocess.DEVNULL

@@ -17,10 +17,7 @@ from neuprim.export import shared
 from neuprim.runs.export import export_run
 from tests.plugins import marked
 
-
-@pytest.fixture(autouse=True)
-def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared, "_SIZE", 64)
+pytestmark = pytest.mark.usefixtures("small_pictures")
 
 
 def read_glb(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

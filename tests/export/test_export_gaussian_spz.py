@@ -14,16 +14,14 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.io.ply import read_ply
 from neuprim.core.io.spz import encode_spz
 from neuprim.core.model import sh
-from neuprim.export import gaussian_spz, shared
+from neuprim.export import gaussian_spz
 from neuprim.runs.export import export_run
 from tests.plugins import marked
 
 gsply = pytest.importorskip("gsply", reason="needs gsply: pip install gsply")
 
 
-@pytest.fixture(autouse=True)
-def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared, "_SIZE", 64)
+pytestmark = pytest.mark.usefixtures("small_pictures")
 
 
 def test_the_gaussians_of_the_ply_after_a_half_turn(tmp_path: Path) -> None:

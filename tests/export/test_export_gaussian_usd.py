@@ -9,17 +9,13 @@ import pytest
 
 from neuprim.core.errors import BackendUnavailable
 from neuprim.core.io.ply import read_ply
-from neuprim.export import shared
 from neuprim.runs.export import export_run
 from tests.plugins import marked
 
 pxr = pytest.importorskip("pxr", reason="needs usd-core: pip install 'neuprim[usd]'")
 from pxr import Gf, Usd, UsdGeom, UsdVol  # noqa: E402 - after the check
 
-
-@pytest.fixture(autouse=True)
-def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared, "_SIZE", 64)
+pytestmark = pytest.mark.usefixtures("small_pictures")
 
 
 def test_the_gaussians_of_the_ply(tmp_path: Path) -> None:

@@ -21,7 +21,6 @@ from neuprim.core.model.geometry import quaternion_to_matrix
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.initial_model import initial_model_to_train
 from neuprim.core.train.settings import ModelSettings
-from neuprim.export import shared
 from neuprim.export.gaussian_ply import LAYOUT, SIZES, Gaussians, draw_exported_gaussians, fit_gaussians
 from neuprim.export.shared import ExportHarmonics, fit_export_harmonics
 from neuprim.plugins.registry import load_task
@@ -30,10 +29,7 @@ from neuprim.runs.open import open_run
 from tests.core import tiny
 from tests.plugins import marked
 
-
-@pytest.fixture(autouse=True)
-def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared, "_SIZE", 64)
+pytestmark = pytest.mark.usefixtures("small_pictures")
 
 
 def one_ellipsoid(tmp_path: Path, thickness: float = 6.0) -> Path:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from neuprim.core.errors import BackendUnavailable, ConfigError
-from neuprim.export import shared
 from neuprim.export.mesh import find_export_surface_level
 from neuprim.runs.export import export_run
 from tests.plugins import marked
@@ -21,9 +20,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return marked.static_run(tmp_path_factory.mktemp("runs") / "run", marked.static_model(neurons=2, degree=0))
 
 
-@pytest.fixture(autouse=True)
-def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared, "_SIZE", 64)
+pytestmark = pytest.mark.usefixtures("small_pictures")
 
 
 def srgb(linear: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Read and write SPZ, Niantic's compressed format of 3D Gaussians (github.com/nianticlabs/spz).
 
-Versions 1 to 3 are one gzip stream; version 4 has one zstd stream per attribute. Version 4 is written. Memory for
-reading is at most :data:`_MOST_EXPANSION` times the file's size, whatever the header claims.
+Versions 1 to 3 are one gzip stream; version 4 has one zstd stream per attribute. Version 4 is written. A file that
+expands to more than :data:`_MOST_EXPANSION` times its size is refused, whatever the header claims.
 
 By convention, tools that convert a PLY file of Gaussians to SPZ negate y and z (:data:`SPZ_FROM_DATA`): the axes of SPZ
 files are RUB (x right, y up, z back), those of PLY files from COLMAP data are RDF (y down, z forward).

@@ -72,9 +72,9 @@ def initial_model_to_train(
         distance = torch.from_numpy(cKDTree(cloud.means.numpy()).query(cloud.means.numpy(), k=neighbours + 1)[0][:, 1:])
         scales = distance.square().mean(dim=1).sqrt().clamp_min(1e-6 * extent).float()
     context = InitContext(
-        cloud.means.float(), scales, cloud.colors.float(), generator, settings.init, cloud.conditions, steps=cloud.steps
-    )
-    context.velocities = cloud.velocities
+        cloud.means.float(), scales, cloud.colors.float(), generator, settings.init, cloud.conditions,
+        steps=cloud.steps, velocities=cloud.velocities,
+    )  # fmt: skip
     factor = context.number("scale", 1.0, 0)
     context.scales, context.quats, context.alphas = scales * factor, cloud.quats, cloud.alphas
     axes = cloud.axes

@@ -159,11 +159,8 @@ class TimeDensity(DensityField):
             specs.append(ParameterSpec("window_center", (1,), 3e-3, _initial_time_window_center))
             specs.append(ParameterSpec("log_window", (1,), 1e-2, _initial_log_time_window))
         if "motion" in self.parts:
-            starts = (_initial_velocity, _zero_time_parameters(3))
-            specs += [
-                ParameterSpec(name, (3,), 1e-2, start, lr_unit="extent")
-                for name, start in zip(_MOTION, starts, strict=True)
-            ]
+            specs.append(ParameterSpec("velocity", (3,), 1e-2, _initial_velocity, lr_unit="extent"))
+            specs.append(ParameterSpec("acceleration", (3,), 1e-2, _zero_time_parameters(3), lr_unit="extent"))
         if self.seams:
             specs.append(ParameterSpec("chunk", (1,), 0.0, _zero_time_parameters(1)))
         specs += [ParameterSpec(_SHARE + name, (1,), 0.3, _zero_time_parameters(1)) for name in self.named]

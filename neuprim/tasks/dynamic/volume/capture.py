@@ -28,14 +28,14 @@ from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io.exr import write_exr
 from neuprim.core.io.files import write_json
 from neuprim.core.io.store import Store
-from neuprim.core.io.vdb import VdbFrame, read_grids, read_header
+from neuprim.core.io.vdb import VdbFrame
 from neuprim.core.volumes.density_truth import (
     DensityGridPlacement,
     GridExtent,
 )
-from neuprim.tasks.dynamic.volume.lit_medium import LitMedium, build_medium, draw_lights, vdb_grid_sampler
+from neuprim.tasks.dynamic.volume.lit_medium import LitMedium, build_medium, draw_lights
 from neuprim.tasks.dynamic.volume.medium import Medium
-from neuprim.tasks.dynamic.volume.motion import VelocityGrid
+from neuprim.tasks.dynamic.volume.motion import VelocityGrid, sample_vdb_frame
 from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Light, Optics
 from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation, GridReader
 
@@ -142,23 +142,19 @@ class Capture:
 
         Values are trilinear between voxels, and 0 where the file has none. Raises DataError if the file is damaged.
         """
-        back = np.linalg.inv(self.normalisation.matrix())
-        world = points @ back[:3, :3].T + back[:3, 3]
-        stored = {grid.name for grid in read_header(frame.path).grids}
         found = {name: np.zeros((len(points), own.width), np.float32) for name, own in self.channels.items()}
-        for grid in read_grids(frame.path, [name for name in self.channels if name in stored]):
-            try:
-                found[grid.name] = vdb_grid_sampler(grid)(world)
-            except DataError as error:
-                raise DataError(f"{frame.path}: {error}") from error
-        return found
+        return found | sample_vdb_frame(frame, self.channels, self._world_points(points))
+
+    def _world_points(self, points: np.ndarray) -> np.ndarray:
+        back = np.linalg.inv(self.normalisation.matrix())
+        world: np.ndarray = points @ back[:3, :3].T + back[:3, 3]
+        return world
 
     def read_velocities(self, grid: VelocityGrid, frame: VdbFrame, points: torch.Tensor) -> torch.Tensor:
         """Return (M, 3) float32 velocities of a frame at ``points`` (M, 3), scene units per unit of time."""
         matrix, (first, last) = self.normalisation.matrix(), self.clock
-        back = np.linalg.inv(matrix)
-        world = points.double().numpy() @ back[:3, :3].T + back[:3, 3]
-        return torch.from_numpy(grid.sample(frame, world) @ matrix[:3, :3].T * max(last - first, 1)).float()
+        found = grid.sample(frame, self._world_points(points.double().numpy()))
+        return torch.from_numpy(found @ matrix[:3, :3].T * max(last - first, 1)).float()
 
     def placement(self) -> DensityGridPlacement:
         """Return the scene's position in the world of its .vdb files, with frame numbers, times and grid names."""

@@ -6,7 +6,7 @@ the one is taken with which velocities carry the extinction of a frame best to t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,9 +21,24 @@ VELOCITY_NAMES = ("velocity", "vel", "v")
 
 _PAIRS, _POINTS = 6, 4096  # pairs of frames that are compared, and points in each
 _MATTER = 0.01  # least extinction of a point, over the largest of its frame
-_STEPS = np.geomspace(0.05, 30.0, 64)  # ways of fast points between two frames that are tried, in voxels
+_STEPS = np.geomspace(0.05, 30.0, 64)  # displacements of fast points between two frames to try, in voxels
 _FAST = 90.0  # percentile of speeds
 _EXPLAINED = 0.1  # least part of the squared change between frames that velocities must explain
+
+
+def sample_vdb_frame(frame: VdbFrame, names: Iterable[str], world: np.ndarray) -> dict[str, np.ndarray]:
+    """Return name -> (M, C) float32 values, at ``world`` (M, 3), of those of the grids ``names`` that a frame has.
+
+    Raises:
+        DataError: the file or a grid cannot be read.
+    """
+    stored, found = {grid.name for grid in read_header(frame.path).grids}, dict[str, np.ndarray]()
+    for grid in read_grids(frame.path, [name for name in names if name in stored]):
+        try:
+            found[grid.name] = vdb_grid_sampler(grid)(world)
+        except DataError as error:
+            raise DataError(f"{frame.path}: {error}") from error
+    return found
 
 
 class VelocityGrid(NamedTuple):
@@ -34,13 +49,8 @@ class VelocityGrid(NamedTuple):
 
     def sample(self, frame: VdbFrame, world: np.ndarray) -> np.ndarray:
         """Return (M, 3) float64 velocities at ``world`` (M, 3), world units per frame number; 0 without the grid."""
-        if self.name not in {grid.name for grid in read_header(frame.path).grids}:
-            return np.zeros((len(world), 3))
-        try:
-            (grid,) = read_grids(frame.path, [self.name])
-            return self.unit * vdb_grid_sampler(grid)(world).astype(np.float64)
-        except DataError as error:
-            raise DataError(f"{frame.path}: {error}") from error
+        found = sample_vdb_frame(frame, [self.name], world)
+        return self.unit * found.get(self.name, np.zeros((len(world), 3))).astype(np.float64)
 
 
 def find_velocity_grid(frames: Sequence[VdbFrame], wanted: str) -> str | None:

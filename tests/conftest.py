@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     # Each worker has one core; more threads of torch wait for each other. Torch reads this when it is imported.
@@ -16,19 +17,29 @@ from neuprim.core.compute import device
 hypothesis.settings.register_profile("neuprim", deadline=None)  # a busy machine is no failure
 hypothesis.settings.load_profile("neuprim")
 
+TESTS = Path(__file__).parent
+
 SLOW = 3600.0
 """Seconds that a test marked slow may take; the others have ``timeout`` of pyproject.toml."""
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let slow tests take their time, and move the extremes behind the tests of searches.
+FIRST = (
+    "numerics/test_equivalence.py", "cli/test_torchrun.py", "plugins/test_new_task.py",
+    "runs/launch/test_launch_processes.py", "search/test_target_run.py", "search/test_ablation.py",
+    "conformance/test_checks.py", "webpage/test_page_person.py", "viewer/test_live_browser.py",
+)  # fmt: skip
+"""Files with long tests, which start first so that no worker ends alone. While one worker compiles the kernels of the
+first file, another compiles those of runs; the other files of numerics find them compiled."""
 
-    Two workers that draw the extremes early would compile the same kernels at once.
-    """
-    extremes = [item for item in items if item.path.name == "test_extremes.py"]
-    others = [item for item in items if item.path.name != "test_extremes.py"]
-    after = [at for at, item in enumerate(others, 1) if item.path.parent.name == "search"] or [len(others)]
-    items[:] = others[: after[-1]] + extremes + others[after[-1] :]
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.option.loadscopereorder = False  # of pytest-xdist, which would start with the files of most tests
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Let slow tests take their time, and begin with the files :data:`FIRST`."""
+    places = {TESTS / name: place for place, name in enumerate(FIRST)}
+    items.sort(key=lambda item: places.get(item.path, len(FIRST)))
     for item in items:
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(SLOW))

@@ -1,4 +1,4 @@
-"""A test that hangs fails by name after a while, and does not hold up the rest."""
+"""A test that hangs fails by name after a while, and does not hold up the rest; long files start first."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import FIRST, TESTS
 from tests.systems import posix
 
 ROOT = Path(__file__).parents[1]
@@ -16,6 +17,10 @@ ROOT = Path(__file__).parents[1]
 
 def test_every_test_has_a_limit(pytestconfig: pytest.Config) -> None:
     assert 60 <= float(pytestconfig.getini("timeout")) <= 600
+
+
+def test_the_files_that_start_first_exist() -> None:
+    assert all((TESTS / name).is_file() for name in FIRST)
 
 
 @posix  # elsewhere the whole process ends with the test

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from pathlib import Path
 from typing import Any
@@ -67,10 +68,6 @@ def cloud(count: int = 300, seed: int = 0) -> Primitives:
     return Primitives(density, colour, params)
 
 
-def transmittance(model: Primitives, light: Tensor) -> Tensor:
-    return shaded(model, light).double()
-
-
 def shaded(model: Primitives, light: Tensor) -> Tensor:
     conditions = {"time": torch.tensor(0.5), "light": light}
     geometry, density = model.lower_density(conditions)
@@ -79,11 +76,14 @@ def shaded(model: Primitives, light: Tensor) -> Tensor:
     return found
 
 
-def exact_transmittance(model: Primitives, light: Tensor, steps: int = 400) -> Tensor:
-    """exp(-integral of sigma) from each centre to the light, float64, by the midpoint rule over 2 scene units."""
+@functools.cache
+def exact_transmittance(light: tuple[float, float, float], steps: int = 100) -> Tensor:
+    """exp(-integral of sigma) from each centre of the cloud to the light, float64, by the midpoint rule over 2 scene
+    units; 400 steps differ by .0013 at most."""
+    model = cloud()
     geometry, form = model.lower_density({"time": torch.tensor(0.5)})
     means = geometry.means.double()
-    towards = light.double() - means
+    towards = torch.tensor(light).double() - means
     length = towards.norm(dim=1).clamp_max(2.0)
     units = towards / towards.norm(dim=1, keepdim=True)
     place = Geometry(means, geometry.log_scales.double(), geometry.quats.double())
@@ -113,8 +113,7 @@ def exact_transmittance(model: Primitives, light: Tensor, steps: int = 400) -> T
 def test_light_arrives_as_the_extinction_lets_it(
     light: tuple[float, float, float], most: float, either_way: str
 ) -> None:
-    model, place = cloud(), torch.tensor(light)
-    found, exact = (f(model, place) for f in (transmittance, exact_transmittance))
+    found, exact = shaded(cloud(), torch.tensor(light)).double(), exact_transmittance(light)
     assert exact.min() < 0.2 and exact.max() > 0.7
     wrong = (found - exact).abs()
     assert float(wrong.mean()) < 0.025 and float(wrong.max()) < most

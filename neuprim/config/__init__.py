@@ -16,20 +16,7 @@ from neuprim.config.stored_run import read_stored_config
 from neuprim.config.task_files import check_config_groups, check_scene_config, list_task_presets, read_task_config
 
 __all__ = [
-    "Job",
-    "RunConfig",
-    "RunSettings",
-    "check_config_groups",
-    "check_scene_config",
-    "compose",
-    "compose_all",
-    "expand_sweep_overrides",
-    "current_config_provenance",
-    "preset_settings",
-    "list_task_presets",
-    "read_stored_config",
-    "find_config_scene",
-    "find_config_plugins",
-    "read_task_config",
-    "load_config_task",
-]
+    "Job", "RunConfig", "RunSettings", "check_config_groups", "check_scene_config", "compose", "compose_all",
+    "current_config_provenance", "expand_sweep_overrides", "find_config_plugins", "find_config_scene",
+    "list_task_presets", "load_config_task", "preset_settings", "read_stored_config", "read_task_config",
+]  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any
 
 from torch import Tensor
@@ -84,6 +85,16 @@ class Chunks:
 
     parts: tuple[Chunk, ...]
     join: Callable[[Sequence[Primitives]], Primitives]
+
+
+def lazy_function(place: str) -> Callable[..., Any]:
+    """Return a wrapper of the function ``"MODULE:NAME"``; MODULE is imported when the wrapper is called."""
+
+    def call(*arguments: Any) -> Any:
+        module, name = place.split(":")
+        return getattr(import_module(module), name)(*arguments)
+
+    return call
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ from string import Template
 
 from torch import Tensor
 
+from neuprim.core.io.json_reader import finite_json_number
 from neuprim.report.charts import Chart, draw_svg
 from neuprim.report.pictures import inline_picture
-from neuprim.report.run_record import as_reported_number
 
 MISSING = "–"
 
@@ -166,7 +166,7 @@ def format_decimal(value: float | None, digits: int, unit: str = "") -> str:
 
 def format_report_count(value: object) -> str:
     """Format a whole number with thousands separators; other numbers with up to two decimals."""
-    found = as_reported_number(value)
+    found = finite_json_number(value)
     if found is None:
         return MISSING
     return f"{round(found):,}" if found == round(found) else f"{found:,.2f}"
@@ -174,7 +174,7 @@ def format_report_count(value: object) -> str:
 
 def format_report_bytes(value: object) -> str:
     """Format a size in bytes with a unit, in powers of 1000."""
-    found = as_reported_number(value)
+    found = finite_json_number(value)
     if found is None:
         return MISSING
     for unit in ("B", "kB", "MB"):
@@ -186,7 +186,7 @@ def format_report_bytes(value: object) -> str:
 
 def format_report_duration(seconds: object) -> str:
     """Format a duration as ``8.3 s``, ``4 min 07 s`` or ``2 h 05 min``."""
-    found = as_reported_number(seconds)
+    found = finite_json_number(seconds)
     if found is None:
         return MISSING
     if found < 59.95:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.json_reader import load_json
+from neuprim.core.io.json_reader import finite_json_number, load_json
 from neuprim.core.metrics import metric_from_json
 
 
@@ -59,7 +58,7 @@ class ReportedRun:
 
     def series(self, x: str, y: str) -> tuple[list[float], list[float]]:
         """Return two lists: the values of the keys ``x`` and ``y`` in all log lines where both values are finite."""
-        pairs = [(as_reported_number(line.get(x)), as_reported_number(line.get(y))) for line in self.log]
+        pairs = [(finite_json_number(line.get(x)), finite_json_number(line.get(y))) for line in self.log]
         known = [(a, b) for a, b in pairs if a is not None and b is not None]
         return [a for a, _ in known], [b for _, b in known]
 
@@ -75,13 +74,6 @@ def median_and_worst(views: Sequence[Mapping[str, Any]]) -> tuple[int, ...]:
     known = [(value, i) for i, entry in enumerate(views) if (value := metric_from_json(entry, "psnr")) is not None]
     order = [i for _, i in sorted(known)]
     return tuple(dict.fromkeys([order[(len(order) - 1) // 2], order[0]])) if order else ()
-
-
-def as_reported_number(value: object) -> float | None:
-    """Return ``value`` as a float if it is a finite number, else None."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        return None
-    return float(value)
 
 
 def read_reported_run(run_dir: Path) -> ReportedRun:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -92,19 +91,6 @@ def _measure_contrast(model: Primitives, effects: Sensitivity, quality: SearchQu
     return min(max(more / expected, 1e-4), 1.0) if expected > 0 and more > 0 else _CONTRAST
 
 
-class _Sizes(NamedTuple):
-    """Numbers of parameter values that pruning can remove from N primitives.
-
-    ``whole`` (N,) has the number of values of each primitive, without removed units. ``present`` maps the name of a
-    unit to an (N,) bool mask of the primitives that have the unit. ``units`` maps the name to the number of the unit's
-    values per primitive.
-    """
-
-    whole: Tensor
-    present: dict[str, Tensor]
-    units: dict[str, int]
-
-
 def cut_to_loss(
     model: Primitives, prices: Sensitivity, quality: Callable[[Primitives], float], loss: float
 ) -> Primitives:
@@ -119,30 +105,27 @@ def cut_to_loss(
     units = _units(model)
     present = {name: primitives_with_unit(unit, model.params).cpu() for name, unit in units.items()}
     numbers = {name: count_unit_numbers(unit, model.params) for name, unit in units.items()}
-    whole = torch.full((model.count,), float(model.parameters_per_primitive))
+    values = torch.full((model.count,), float(model.parameters_per_primitive))  # without units removed before
     for name, has in present.items():
-        whole -= numbers[name] * (~has).float()
-    sizes = _Sizes(whole, present, numbers)
-    dear = [prices.whole / whole, *(prices.pieces[name] / max(size, 1) for name, size in numbers.items())]
-    low, high = 0.0, max(1e-30, *(float(each.max()) for each in dear if len(each)))
-    start, best = quality(model), _prune_below_price(model, prices, sizes, 0.0)
+        values -= numbers[name] * (~has).float()
+    whole = prices.whole / values
+    pieces = {name: prices.pieces[name] / max(size, 1) for name, size in numbers.items()}
+    known = prices.seen > 0  # nothing is known of primitives in no view
+
+    def prune_below(price: float) -> Primitives:
+        """Return the model without primitives and units whose effect per parameter value is below ``price``."""
+        kept = (~known | (whole >= price)).nonzero()[:, 0]
+        gone = {name: (unit, (pieces[name] < price) & present[name] & known) for name, unit in units.items()}
+        rows = Primitives(model.density, model.colour, zero_units(gone, model.params)).rows(kept.to(model.device))
+        return Primitives(model.density, model.colour, rows)
+
+    low, high = 0.0, max(1e-30, *(float(each.max()) for each in (whole, *pieces.values()) if len(each)))
+    start, best = quality(model), prune_below(0.0)
     for _ in range(_HALVINGS):
         price = (max(low, high * 1e-9) * high) ** 0.5
-        tried = _prune_below_price(model, prices, sizes, price)
+        tried = prune_below(price)
         if tried.count and start - quality(tried) <= loss:
             best, low = tried, price
         else:
             high = price
     return best
-
-
-def _prune_below_price(model: Primitives, prices: Sensitivity, sizes: _Sizes, price: float) -> Primitives:
-    """Return a model without primitives and units whose effect per parameter value is below ``price``."""
-    known = prices.seen > 0  # nothing is known of primitives in no view
-    kept = (~known | (prices.whole / sizes.whole >= price)).nonzero()[:, 0]
-    gone = {}
-    for name, unit in _units(model).items():
-        cheap = prices.pieces[name] / max(sizes.units[name], 1) < price
-        gone[name] = (unit, cheap & sizes.present[name] & known)
-    rows = Primitives(model.density, model.colour, zero_units(gone, model.params)).rows(kept.to(model.device))
-    return Primitives(model.density, model.colour, rows)

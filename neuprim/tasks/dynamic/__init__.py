@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -27,7 +26,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.layer_frame import LayerFrame, LayerSpec
 from neuprim.core.render.light import LIGHT_LAYERS
-from neuprim.core.task import API_VERSION, SceneSpec, TaskSpec
+from neuprim.core.task import API_VERSION, SceneSpec, TaskSpec, lazy_function
 from neuprim.core.train.losses import photometric
 from neuprim.core.validation import validate_choices
 from neuprim.tasks.dynamic.colour import FREQUENCIES, TimeHarmonics
@@ -218,15 +217,6 @@ _LAYERS = (
 # ---------------------------------------------------------------- the task
 
 
-def _import_dynamic_function(module: str, function: str) -> Callable[..., Any]:
-    """Return a wrapper of ``function`` that imports ``module`` only when called, since loaders import many modules."""
-
-    def call(*arguments: Any) -> Any:
-        return getattr(import_module(f"{__package__}.{module}"), function)(*arguments)
-
-    return call
-
-
 _VOLUME_SCENES = {
     "smoke_fire": "fire under dark smoke, 100 timesteps; simulated, or scene.vdb=DIR",
     "colorful_smoke": "coloured smoke, 128 timesteps; simulated, or scene.vdb=DIR",
@@ -235,7 +225,7 @@ _VOLUME_SCENES = {
     "vdb": "any sequence of .vdb files: scene.vdb=DIR",
 }
 _VOLUME_FUNCTIONS = tuple(
-    _import_dynamic_function("volume.volume_scene", function)
+    lazy_function(f"neuprim.tasks.dynamic.volume.volume_scene:{function}")
     for function in ("load_volume_scene", "open_volume_source", "open_captured_vdb_frames", "split_into_time_chunks")
 )
 _MULTIVIEW = "images with a time per frame (D-NeRF layout): scene.path=DIR"
@@ -247,7 +237,7 @@ TASK = TaskSpec(
     config_package="neuprim.tasks.dynamic.conf",
     scenes=(
         *(SceneSpec(name, summary, *_VOLUME_FUNCTIONS) for name, summary in _VOLUME_SCENES.items()),
-        SceneSpec("multiview", _MULTIVIEW, _import_dynamic_function("multiview", "load_moving_multiview")),
+        SceneSpec("multiview", _MULTIVIEW, lazy_function("neuprim.tasks.dynamic.multiview:load_moving_multiview")),
     ),
     build=_build_time_fields,
     loss=photometric,

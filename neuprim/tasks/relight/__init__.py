@@ -9,8 +9,7 @@ compare the clamped values. Metrics with "display" convert the clamped values to
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -27,7 +26,7 @@ from neuprim.core.model.cosine import DENSITY_OPTIONS, DENSITY_TRADE, CosineDens
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.light import LIGHT_LAYERS, VISIBILITY
-from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
+from neuprim.core.task import API_VERSION, SceneSpec, TaskSpec, lazy_function
 from neuprim.core.train.losses import l1
 from neuprim.core.validation import validate_choices
 from neuprim.scenes import PIXEL_CLASSES
@@ -89,14 +88,6 @@ def _build_relight_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[D
     falloff = dataset_lighting(dataset).falloff == "inverse_square"
     density = CosineDensity(model["neurons"], **model["density"])
     return density, _light_colour_field(model, falloff, typical_light(dataset, falloff))
-
-
-def _load_relight_scene(function: str, settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load a scene by ``function`` of :mod:`neuprim.tasks.relight.datasets`, which is imported on first use."""
-    from neuprim.tasks.relight import datasets
-
-    loader: Callable[..., Dataset] = getattr(datasets, function)
-    return loader(settings, context)
 
 
 _MIN_ALPHA = 1.0 / 255.0  # least alpha of a pixel that shows matter
@@ -246,12 +237,12 @@ TASK = TaskSpec(
         SceneSpec(
             "lit_solids",
             "built in: solids and a glossy ring under moving point lights, with shadows",
-            partial(_load_relight_scene, "load_lit_solids_for_relighting"),
+            lazy_function("neuprim.tasks.relight.datasets:load_lit_solids_for_relighting"),
         ),
         SceneSpec(
             "olat",
             "GS3 / NRHints layout: a light position per image, PNG or EXR: scene.path=DIR",
-            partial(_load_relight_scene, "load_olat"),
+            lazy_function("neuprim.tasks.relight.datasets:load_olat"),
         ),
     ),
     build=_build_relight_fields,

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
-from importlib import import_module
+from collections.abc import Mapping
 from typing import Any
 
 from neuprim.core.data import Dataset
@@ -12,7 +10,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.cosine import DENSITY_OPTIONS, DENSITY_TRADE, CosineDensity
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.gaussian import GaussianDensity
-from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
+from neuprim.core.task import API_VERSION, SceneSpec, TaskSpec, lazy_function
 from neuprim.core.train.losses import photometric
 from neuprim.core.train.settings import ModelSettings
 from neuprim.core.validation import validate_choices
@@ -69,53 +67,34 @@ def _tunable_static_settings(model: Mapping[str, Any]) -> dict[str, tuple[int, .
     return {**(DENSITY_TRADE if cosine else {}), **colour}
 
 
-def _load_static_scene(module: str, function: str, settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load a scene by ``function`` of ``module``, imported on first use because it may need an optional library."""
-    loader: Callable[..., Dataset] = getattr(import_module(f"neuprim.tasks.static.{module}"), function)
-    return loader(settings, context)
-
-
 def _static_dataset_facts(dataset: Dataset) -> Mapping[str, Any]:
     """Return facts for a model's header: name and ``scene_from_file`` matrix of a mesh file; {} for other scenes."""
     return dataset.extra if isinstance(dataset.extra, dict) else {}
 
+
+_SCENES = {
+    "solids": (
+        "built in: sharp edges, thin rods, a curved handle; generated in seconds",
+        "datasets:load_solids_dataset",
+    ),
+    "room": (
+        "built in: the solids in a textured room, taken like photographs: lens, exposures, points",
+        "datasets:load_room_dataset",
+    ),
+    "mesh": ("your own model, ray-cast: a .glb, .gltf, .obj, .ply or .stl: scene.path=FILE", "mesh:load_mesh"),
+    "blender": ("NeRF-synthetic layout: transforms_train.json, RGBA images", "datasets:load_blender"),
+    "nerfstudio": ("instant-ngp / nerfstudio transforms.json", "datasets:load_nerfstudio"),
+    "colmap": ("COLMAP sparse/0 and images (needs neuprim[colmap])", "datasets:load_colmap"),
+}
 
 TASK = TaskSpec(
     api=API_VERSION,
     name="static",
     summary="A scene that does not change, from photographs or other posed images",
     config_package="neuprim.tasks.static.conf",
-    scenes=(
-        SceneSpec(
-            "solids",
-            "built in: sharp edges, thin rods, a curved handle; generated in seconds",
-            partial(_load_static_scene, "datasets", "load_solids_dataset"),
-        ),
-        SceneSpec(
-            "room",
-            "built in: the solids in a textured room, taken like photographs: lens, exposures, points",
-            partial(_load_static_scene, "datasets", "load_room_dataset"),
-        ),
-        SceneSpec(
-            "mesh",
-            "your own model, ray-cast: a .glb, .gltf, .obj, .ply or .stl: scene.path=FILE",
-            partial(_load_static_scene, "mesh", "load_mesh"),
-        ),
-        SceneSpec(
-            "blender",
-            "NeRF-synthetic layout: transforms_train.json, RGBA images",
-            partial(_load_static_scene, "datasets", "load_blender"),
-        ),
-        SceneSpec(
-            "nerfstudio",
-            "instant-ngp / nerfstudio transforms.json",
-            partial(_load_static_scene, "datasets", "load_nerfstudio"),
-        ),
-        SceneSpec(
-            "colmap",
-            "COLMAP sparse/0 and images (needs neuprim[colmap])",
-            partial(_load_static_scene, "datasets", "load_colmap"),
-        ),
+    scenes=tuple(
+        SceneSpec(name, summary, lazy_function(f"neuprim.tasks.static.{function}"))
+        for name, (summary, function) in _SCENES.items()
     ),
     build=_build_static_fields,
     loss=photometric,

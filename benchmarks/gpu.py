@@ -390,7 +390,7 @@ def make_tables(records: Sequence[Record]) -> dict[str, str]:
         "gpu-training": "train",
         "gpu-runs": "runs",
     }
-    return {marker: texts[part] for marker, part in markers.items() if texts[part]}
+    return {marker: texts[part] for marker, part in markers.items()}
 
 
 def main() -> None:
@@ -420,13 +420,13 @@ def main() -> None:
             parser.error("the part runs wants --mic DIR")
         if "train" in args.parts:
             require_folders(parser, args, args.trained)
+        name = re.sub(r"[^a-z0-9]+", "_", device.lower()).strip("_")
         for part in args.parts:
             result[part] = measures[part]()
             if part in COLUMNS:
                 make_table(COLUMNS[part], result[part])
-        if args.record:
-            name = re.sub(r"[^a-z0-9]+", "_", device.lower()).strip("_")
-            update_record(Path(FOLDER / f"{name}.json"), **result)
+            if args.record:  # after each part, as a later one may fail
+                update_record(Path(FOLDER / f"{name}.json"), **result)
     if args.only_print or args.record:
         for marker, text in make_tables(read_records()).items():
             if args.docs or args.record:

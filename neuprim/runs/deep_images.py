@@ -16,6 +16,7 @@ from torch import Tensor
 
 from neuprim.core.cameras.pinhole import AnyCamera, RayCamera
 from neuprim.core.data import View
+from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import LoweredPrimitives, Primitives
@@ -59,10 +60,15 @@ def draw_deep_image(
         lights: conditions of lights, over which the light of a sample is summed; empty: the view's own light.
         on_alpha: function that is called with the alpha of the whole image, once per light.
         scale: scene units per unit of the returned depths.
+
+    Raises:
+        ConfigError: the model shades whole pixels, not primitives.
     """
     pixels, samples = list[Tensor](), list[Tensor]()
     with torch.no_grad():
         frames = [model.lower(view.camera, {**view.conditions, **light}, settings) for light in lights or ({},)]
+        if any(frame.shade is not None for frame in frames):
+            raise ConfigError("--deep: the model has a shadow per pixel; expected one per primitive or none")
         transmittance = torch.ones(view.camera.height, view.camera.width)
         members, edges = _slice_by_depth(frames[0], view.camera, settings, most, scale)
         for i, rows in enumerate(members):

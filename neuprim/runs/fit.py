@@ -5,6 +5,7 @@ A training reports its progress as events: it calls a listener function with eac
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -41,9 +42,12 @@ _CURVE_VIEWS = 5
 _CURVE_PSNR_MAX = 200.0
 """Upper bound of a view's PSNR during the training, dB. Equal images have an infinite PSNR, which JSON cannot store."""
 
-_TRIAL_PRIMITIVES, _TRIAL_STEPS, _TRIAL_SECONDS, _TRIAL_WARM = 10_000, 20, 2.0, 3
-"""Trial training that measures the time per step: number of primitives, largest number of timed steps, largest time in
-seconds, warm-up steps before the clock starts. If the data offer fewer starting points, there are fewer primitives."""
+_TRIAL_PRIMITIVES = 10_000
+"""Number of primitives for ``model.primitives=auto`` of a trial training; fewer if the data offer fewer points."""
+
+_TRIAL_STEPS, _TRIAL_SECONDS, _TRIAL_WARM, _TRIAL_GPU_WARM = 40, 2.0, 3, 24
+"""Limits on the timed steps of a trial training, and steps before the clock starts. On a GPU, the first steps of each
+kind are recorded as CUDA graphs."""
 
 
 __all__ = ["Evaluated", "Finishing", "Fitted", "Note", "Preparing", "Step", "fit"]
@@ -338,16 +342,26 @@ def _choose_run_size(job: Job, dataset: Dataset, loss: Loss, events: Events) -> 
     trainer = make_run_trainer(Job(trial, job.task), dataset, loss)
     compile_run_kernels(trainer, events)
     events(Preparing("a test of the pace, for model.primitives=auto"))
-    with use_one_torch_thread_for_run():
-        for _ in range(_TRIAL_WARM):
-            trainer.train_step()
-        start = trainer.elapsed
-        while trainer.step < _TRIAL_WARM + _TRIAL_STEPS and trainer.elapsed < start + _TRIAL_SECONDS:
-            trainer.train_step()
-    pace = (trainer.elapsed - start) / ((trainer.step - _TRIAL_WARM) * trainer.model.count)
+    pace = time_run_step(trainer) / trainer.model.count
     model, seconds = config.model.with_count_for(config.train, pace), config.train.max_seconds
     events(Note(f"model.primitives=auto: {model.count:,} for {seconds:g} s, as one takes {1e6 * pace:.2g} µs a step"))
     return model.count
+
+
+def time_run_step(trainer: Trainer) -> float:
+    """Take some training steps, and return the seconds that one took. Use the trainer for nothing else afterwards."""
+    with use_one_torch_thread_for_run():
+        for _ in range(_TRIAL_WARM if trainer.recorder is None else _TRIAL_GPU_WARM):
+            trainer.train_step()
+        trainer.settle()
+        first, start = trainer.step, time.perf_counter()
+        while trainer.step < first + _TRIAL_STEPS and time.perf_counter() < start + _TRIAL_SECONDS:
+            trainer.train_step()
+        trainer.settle()
+        pace = (time.perf_counter() - start) / (trainer.step - first)
+    if trainer.recorder is not None:
+        trainer.recorder.reset()
+    return pace
 
 
 def compile_run_kernels(trainer: Trainer, events: Events = ignore_run_event) -> None:

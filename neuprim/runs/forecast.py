@@ -15,11 +15,11 @@ from neuprim.core.errors import NeuprimError
 from neuprim.core.metrics import psnr, ssim
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.plugins.registry import TASKS
-from neuprim.runs.fit import make_run_loss, make_run_trainer, use_one_torch_thread_for_run
+from neuprim.runs.fit import make_run_loss, make_run_trainer, time_run_step, use_one_torch_thread_for_run
 from neuprim.runs.measure import render_image
 
 _LEAST_STEPS = 500  # a shorter training has no forecast
-_WARM, _STEPS, _SECONDS, _POINTS = 3, 40, 2.0, 4096  # of the trial: steps before the clock starts, limits, voxels
+_POINTS = 4096  # voxels of the trial
 
 
 @dataclass(frozen=True)
@@ -72,12 +72,7 @@ def _time_steps_on_noise(config: RunConfig, width: int, height: int) -> Forecast
         dataset = noise_dataset(trial, width, height, _POINTS)
         trainer = make_run_trainer(trial, dataset, make_run_loss(trial))
         trainer.step = (config.train.iterations or 0) // 2
-        for _ in range(_WARM):
-            trainer.train_step()
-        first, start = trainer.step, trainer.elapsed
-        while trainer.step < first + _STEPS and trainer.elapsed < start + _SECONDS:
-            trainer.train_step()
-        pace = (trainer.elapsed - start) / (trainer.step - first)
+        pace = time_run_step(trainer)
         truth = dataset.test.pixels(0).over(dataset.background)
         for _ in range(2):  # the first one may load code
             begin = time.monotonic()

@@ -235,6 +235,8 @@ class RunExrLayers:
             (self.compression != "zip", "no --compression, as deep files can use only zip"),
             (self.point.resolution != 1.0, "resolution=1"),
             (self.point.settings.sort != "center", "renderer.sort=center, the order of slices of depth"),
+            (self.point.settings.samples != 1, "renderer.samples=1, as a mean of rays has no depths"),
+            (not {"A", "Z", "ZBack"}.isdisjoint(self.channels.names), "channels with other names than A, Z and ZBack"),
         ):
             if fault:
                 raise ConfigError(f"--deep: expected {expected}")

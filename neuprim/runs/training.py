@@ -44,6 +44,7 @@ from neuprim.runs.fit import (
     ignore_run_event,
     make_run_loss,
     prepare_training,
+    time_run_step,
     train_run_steps,
     use_one_torch_thread_for_run,
 )
@@ -76,9 +77,6 @@ VOXELS_EVERY = 8
 """Largest interval, in fine-tuning steps, between two steps that also use voxels (known extinction), if the run used
 voxels. The longer interval of a run makes a few hundred steps miss some frames, whose extinction then drifts. With an
 interval of 4, images get worse."""
-
-_PACE_WARMUP, _PACE_STEPS = 5, 20
-"""Number of warm-up steps, and of timed steps after them, to measure the time per fine-tuning step."""
 
 BetweenSteps = Callable[[Fitted, threading.Event], None]
 """Callback on the training thread, before the first step and after every step. The arguments are the training
@@ -342,10 +340,5 @@ def count_run_finetune_steps(seconds: float, job: Job, dataset: Dataset, model: 
     """Return how many fine-tuning steps fit into ``seconds``, from the measured time per step; 0 for 0 seconds."""
     if seconds <= 0:
         return 0
-    trainer = make_run_finetune_trainer(job, dataset, model, _PACE_WARMUP + _PACE_STEPS)
-    for _ in range(_PACE_WARMUP):
-        trainer.train_step()
-    before = trainer.elapsed
-    for _ in range(_PACE_STEPS):
-        trainer.train_step()
-    return max(int(seconds * _PACE_STEPS / max(trainer.elapsed - before, 1e-9)), 1)
+    pace = time_run_step(make_run_finetune_trainer(job, dataset, model, LONG))
+    return max(int(seconds / max(pace, 1e-9)), 1)

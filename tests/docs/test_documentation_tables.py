@@ -100,7 +100,7 @@ TABLES: dict[str, tuple[str, str, Callable[[Any], object]]] = {
     ),
     **{
         name: ("docs/results/gpu.md", "gpu", lambda s, name=name: s.make_tables(s.read_records())[name])
-        for name in ("gpu-parity", "gpu-times", "gpu-steps", "gpu-training", "gpu-runs")
+        for name in ("gpu-parity", "gpu-times", "gpu-frames", "gpu-steps", "gpu-training", "gpu-runs")
     },
     "ranks": ("docs/results/performance.md", "ranks", lambda s: s.pace_table(record_of(s))),
     **{

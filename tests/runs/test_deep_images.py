@@ -108,12 +108,22 @@ def test_lights_are_summed() -> None:
     assert (found[..., :3] - expected).abs().max() < 1e-5
 
 
-def test_an_empty_view_has_no_samples() -> None:
+@pytest.mark.parametrize("half", [False, True])
+def test_an_empty_view_has_no_samples(half: bool, tmp_path: Path) -> None:
     away = replace(
         VIEW, camera=replace(VIEW.camera, viewmat=VIEW.camera.viewmat * torch.tensor([1, 1, -1, 1.0])[:, None])
     )
     image = draw_deep_image(volume(), away, EXACT, (), 4)
     assert not image.counts.any() and len(image.alpha) == 0 and image.rgb.shape == (0, 3)
+    writer(half=half).write(tmp_path / "a.exr", volume(), away)
+    found, _ = stored(tmp_path / "a.exr")
+    assert all(x is None or len(x) == 0 for x in found["A"].ravel())
+
+
+def test_a_shadow_per_pixel_is_refused() -> None:
+    view = replace(VIEW, conditions=light(2, -1, 3))
+    with pytest.raises(ConfigError, match="--deep: the model has a shadow per pixel; expected one per primitive"):
+        draw_deep_image(lit(LightNetwork(3, visibility="pixel"), torch.float32), view, EXACT, (), 4)
 
 
 # ---------------------------------------------------------------- files
@@ -177,6 +187,8 @@ def test_a_model_on_a_card_makes_the_same_file(tmp_path: Path, monkeypatch: pyte
         ({"compression": "dwaa"}, "no --compression"),
         ({"point": RenderConfig(EXACT, resolution=0.5)}, "resolution=1"),
         ({"point": RenderConfig(replace(EXACT, sort="entry"))}, "renderer.sort=center"),
+        ({"point": RenderConfig(replace(EXACT, samples=2))}, "renderer.samples=1"),
+        ({"channels": Channels(("X", "Y", "Z"), color_space="linear")}, "channels with other names than A, Z"),
     ],
 )
 def test_options_without_meaning_are_refused(changes: dict[str, Any], words: str) -> None:

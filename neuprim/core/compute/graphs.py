@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
+from typing import Any
 
 import torch
 
@@ -31,7 +33,8 @@ class GraphRecorder:
         self._on_gpu = where.type == device.CUDA
         self._tried = not self._on_gpu
         self._stream = torch.cuda.Stream(where) if self._on_gpu else None
-        self._pool = torch.cuda.graph_pool_handle() if self._on_gpu else None
+        self._graphs: list[torch.cuda.CUDAGraph] = []
+        self._pool: Any = None
 
     def record(self, function: Callable[[], None]) -> Callable[[], None]:
         """Return a function with the effect of ``function``.
@@ -46,10 +49,7 @@ class GraphRecorder:
             if replay:
                 replay[0]()
             elif self._tried:
-                graph = torch.cuda.CUDAGraph()
-                # "thread_local": other threads may use the GPU meanwhile
-                with torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"):
-                    function()
+                graph = self._capture(function)
                 replay.append(graph.replay)
                 graph.replay()
             else:
@@ -57,6 +57,32 @@ class GraphRecorder:
                 self._call(function)
 
         return run
+
+    def clear(self) -> None:
+        """Free all graphs. Functions that :meth:`record` returned must not be called any more.
+
+        Without this method, Python's collector would free them at any time. One graph alone cannot be freed: some
+        versions of torch free memory with it that the other graphs of the stream use.
+        """
+        for graph in self._graphs:
+            graph.reset()
+        self._graphs.clear()
+        self._pool = None
+
+    def _capture(self, function: Callable[[], None]) -> torch.cuda.CUDAGraph:
+        graph = torch.cuda.CUDAGraph()
+        self._pool = self._pool or torch.cuda.graph_pool_handle()
+        collects = gc.isenabled()
+        gc.disable()  # a graph of another recorder that the collector frees now would end the capture
+        try:
+            # "thread_local": other threads may use the GPU meanwhile
+            with torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"):
+                function()
+        finally:
+            if collects:
+                gc.enable()
+        self._graphs.append(graph)
+        return graph
 
     def _call(self, function: Callable[[], None]) -> None:
         stream, current = self._stream, torch.cuda.current_stream(self._where)

@@ -95,12 +95,12 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
 
 def _read_spz_vertices(path: Path) -> PlyVertices:
     """Return the Gaussians of an SPZ file as vertices, with y and z negated, as other tools convert them."""
-    found = read_spz(path)
+    found = read_spz(path, degree=0)
     w, x, y, z = found.quats.T
     quats = np.stack([-x, w, -z, y], 1)  # half turn around x
     with np.errstate(divide="ignore"):
         logits = np.log(found.opacities) - np.log1p(-found.opacities)
-    means = found.means @ SPZ_FROM_DATA[:3, :3]
+    means = found.means * np.diag(SPZ_FROM_DATA)[:3]
     table = np.concatenate([means, found.harmonics[:, 0], logits[:, None], found.log_scales, quats], 1)
     names = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *_SCALES, *_ROTATION)
     return PlyVertices(unstructured_to_structured(table, np.dtype([(name, "f8") for name in names])))

@@ -33,7 +33,9 @@ COMPRESSIONS = {
     "piz": OpenEXR.PIZ_COMPRESSION,
     "dwaa": OpenEXR.DWAA_COMPRESSION,
 }
-"""Compressions of written files. All are lossless, except dwaa for R, G, B, Y and other colours."""
+"""Compressions of written files. All are lossless, except dwaa for :data:`_DWA_COLORS`."""
+
+_DWA_COLORS = ("R", "G", "B", "Y", "RY", "BY")  # last parts of names of channels that dwaa stores as half floats
 
 _MAX_NAME_BYTES = 31  # longest channel name that every reader of OpenEXR accepts
 _MAGIC = b"\x76\x2f\x31\x01"
@@ -219,6 +221,10 @@ def write_exr_layers(
     if len(shapes) != 1 or len(shapes[0]) != 2 or 0 in shapes[0]:
         raise DataError(f"{path}: channels to write have shapes {shapes}; expected the same (H, W) for all")
     stored = {name: _exr_values(f"{path}: channel {name}", channel) for name, channel in channels.items()}
+    for name, values in stored.items():
+        if compression == "dwaa" and name.split(".")[-1] in _DWA_COLORS and (most := np.abs(values).max()) > _MAX_HALF:
+            found = f"channel {name}: value {most:.6g} does not fit the compression dwaa (at most {_MAX_HALF:.0f})"
+            raise DataError(f"{path}: {found}; expected zip or piz")
     header = {**(attributes or {}), "compression": COMPRESSIONS[compression], "type": OpenEXR.scanlineimage}
     if visible is not None:
         (top, bottom), (left, right) = (_first_and_last(visible.any(1 - axis)) for axis in (0, 1))
@@ -246,7 +252,7 @@ def write_deep_exr(
         attributes: header attributes, see :func:`write_exr_layers`.
     """
     numbers = counts.flatten()
-    filled, ends = numbers.nonzero()[:, 0].tolist(), numbers.cumsum(0)
+    filled, ends = numbers.nonzero()[:, 0].tolist() or [0], numbers.cumsum(0)  # OpenEXR takes the type from a pixel
     stored = {}
     for name, channel in samples.items():
         parts = np.split(_exr_values(f"{path}: channel {name}", channel)[:, 0], ends[:-1].numpy())
@@ -279,7 +285,7 @@ def _exr_values(where: str, channel: ExrChannel) -> np.ndarray:
     if len(bad):
         y, x = bad[0].tolist()
         raise DataError(f"{where}: value {values[y, x]} at row {y}, column {x}; expected finite numbers")
-    if channel.half and np.abs(values).max() > _MAX_HALF:
+    if channel.half and np.abs(values).max(initial=0.0) > _MAX_HALF:
         found = f"value {np.abs(values).max():.6g} does not fit 16-bit floats (at most {_MAX_HALF:.0f})"
         raise DataError(f"{where}: {found}; write 32-bit floats (half=False)")
     return np.ascontiguousarray(values, dtype=np.float16 if channel.half else np.float32)

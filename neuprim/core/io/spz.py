@@ -25,7 +25,7 @@ SPZ_FROM_DATA = np.diag([1.0, -1.0, -1.0, 1.0])
 _MAGIC = 0x5053474E
 _HEADER, _OLD_HEADER, _ENTRY = struct.Struct("<IIIBBBBI12x"), struct.Struct("<IIIBBBB"), struct.Struct("<QQ")
 _COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16, 4: 25}  # spherical harmonics of each degree
-_MOST_EXPANSION = 100  # usual files expand by less than 10
+_MOST_EXPANSION = 30  # usual files expand by less than 10
 _FRACTION_BITS = range(4, 24)  # that the reference implementation writes
 _LARGEST = 2**23 - 1  # of the 24 bits of a coordinate
 _SCALE_STEPS, _SMALLEST_LOG = 16.0, -10.0
@@ -105,16 +105,20 @@ def _pack_quaternions(quats: np.ndarray) -> np.ndarray:
     return (packed | (largest.astype(np.uint32) << 30)).astype("<u4")
 
 
-def read_spz(path: Path) -> SpzGaussians:
-    """Read an SPZ file of version 1 to 4; DataError if it cannot be read, is damaged, or expands too much."""
+def read_spz(path: Path, degree: int = 4) -> SpzGaussians:
+    """Read an SPZ file of version 1 to 4; spherical harmonics above ``degree`` are left out.
+
+    Raises:
+        DataError: the file cannot be read, is damaged, or expands too much.
+    """
     try:
         data = path.read_bytes()
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror or error}); expected an SPZ file") from None
-    return decode_spz(data, str(path))
+    return decode_spz(data, str(path), degree)
 
 
-def decode_spz(data: bytes, where: str) -> SpzGaussians:
+def decode_spz(data: bytes, where: str, most_degree: int = 4) -> SpzGaussians:
     """Return the Gaussians in the bytes of an SPZ file; see :func:`read_spz`. ``where`` names the file in errors."""
     most = max(_MOST_EXPANSION * len(data), 2**16)
     old = data[:2] == b"\x1f\x8b"
@@ -147,7 +151,7 @@ def decode_spz(data: bytes, where: str) -> SpzGaussians:
         parts = _split_gzip_body(body[_OLD_HEADER.size :], count, widths, where)
     else:
         parts = _read_zstd_streams(data, [width for width in widths if width], (count, streams, table), where)
-    return _unpack_gaussians(parts, version, bits, degree)
+    return _unpack_gaussians(parts, version, bits, min(degree, most_degree))
 
 
 def _split_gzip_body(body: bytes, count: int, widths: list[int], where: str) -> list[np.ndarray]:
@@ -194,7 +198,8 @@ def _unpack_gaussians(parts: list[np.ndarray], version: int, bits: int, degree: 
         means = (padded.view("<i4")[:, 0] >> 8).reshape(-1, 3) / 2.0**bits
     harmonics = [(colours[:, None] - 127.5) / _COLOR_SCALE]
     if degree:
-        harmonics.append((parts[5].reshape(len(means), _COEFFICIENTS[degree] - 1, 3) - 128.0) / 128.0)
+        stored = parts[5].reshape(len(means), -1, 3)[:, : _COEFFICIENTS[degree] - 1]
+        harmonics.append((stored - 128.0) / 128.0)
     return SpzGaussians(
         means,
         scales / _SCALE_STEPS + _SMALLEST_LOG,

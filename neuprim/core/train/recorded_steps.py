@@ -189,8 +189,12 @@ class StepRecorder:
         The results of all replayed steps must have been read before (:meth:`settle`).
         """
         assert not self._flights, "settle() comes first"
-        self._programs.clear()
         self._seen.clear()
+        self._discard_programs()
+
+    def _discard_programs(self) -> None:
+        self._programs.clear()
+        self._graphs.clear()
 
     def observe_counts(self, stats: RenderStats) -> None:
         """Read the array sizes that an unrecorded frame needed.
@@ -302,7 +306,8 @@ class StepRecorder:
                 oldest = min(programs, key=lambda key: programs[key].used)
                 if trainer.step - programs[oldest].used < _IDLE_STEPS:
                     return None
-                del programs[oldest]
+                trainer.settle()
+                self._discard_programs()
             program = programs[key] = self._make_program(inputs)
         program.used = trainer.step
         return program

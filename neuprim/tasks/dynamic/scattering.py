@@ -97,6 +97,8 @@ class ScatteringHarmonics(TimeHarmonics):
         anisotropy: argument of :func:`phase_factor`, -0.95 to 0.95; 0: light is scattered equally in all directions.
     """
 
+    stage = None  # type: ignore[assignment]  # shadow maps wait for the GPU
+
     def __init__(
         self, *settings: Any, typical: float = 1.0, octaves: int = 1, share: float = 0.5, anisotropy: float = 0.0,
         **more: Any,

@@ -80,6 +80,28 @@ def test_velocities_that_explain_nothing_are_not_used(tmp_path: Path) -> None:
     assert measure_velocity_grid(capture.frames[:1], capture.reader, "vel") is None
 
 
+@pytest.mark.filterwarnings("ignore::neuprim.core.errors.NeuprimWarning")
+def test_values_of_strangers(tmp_path: Path) -> None:
+    """Voxels that are not finite count as 0, outliers are slowed down, and a grid of numbers is no grid of vectors."""
+    folder = write(tmp_path / "f", 1.0)
+    for number in range(6):
+        density, moving = blob(5.0 + SPEED * number, ("density",))[0], wind(SPEED * VOXEL)
+        density.values.flat[:2], moving.values.flat[:6] = (np.nan, np.inf), 1e30
+        write_vdb(folder / f"ball_{number}.vdb", [density, moving])
+    capture = recorded(dataset(folder, tmp_path)).capture
+    found = measure_velocity_grid(capture.frames, capture.reader, "vel")
+    assert found is not None and found.unit == pytest.approx(1, rel=0.1)
+    corner = (moving.origins[:1] @ moving.transform[:3, :3].T) + moving.transform[:3, 3]
+    assert 5 * SPEED * VOXEL < np.linalg.norm(found.sample(capture.frames[0], corner)) < 20 * SPEED * VOXEL
+    write_vdb(folder / "ball_3.vdb", blob(5.0, ("density", "vel")))
+    with pytest.raises(DataError, match=r"ball_3\.vdb: grid 'vel' has 1 number per voxel; expected 3, as in other"):
+        found.sample(capture.frames[3], corner)
+    far = wind(1.0)
+    write_vdb(folder / "ball_3.vdb", [replace(far, origins=far.origins * np.int32(30_000))])
+    with pytest.raises(DataError, match=r"ball_3\.vdb: grid 'vel': the box has .*scene\.velocity=none ignores"):
+        found.sample(capture.frames[3], corner)
+
+
 def test_which_grid_is_used(tmp_path: Path) -> None:
     frames = recorded(dataset(write(tmp_path / "f", 1.0, "gale"), tmp_path)).capture.frames
     assert find_velocity_grid(frames, "auto") is None and find_velocity_grid(frames, "gale") == "gale"

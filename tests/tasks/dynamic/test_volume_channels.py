@@ -176,6 +176,7 @@ REFUSED: list[tuple[Any, str]] = [
         ["huge"],
         ".vdb: grid 'huge' has 2146689 blocks of voxels that are not empty, which take 6259745124 bytes; at most",
     ),
+    (["hot"], "hot_0.vdb: grid 'hot' has values up to 1e+38; expected at most 1e+15"),
     (["density"], "scene.channels: 'density' is the extinction, which every model learns; expected others"),
     (["../heat"], "expected a list, each the name of a grid, of letters, digits and underscores"),
 ]
@@ -189,7 +190,8 @@ def test_channels_that_cannot_be_learned_are_refused(names: list[str], message: 
         corners = 128 * np.stack(np.meshgrid(*(np.arange(8),) * 3), -1).reshape(-1, 3).astype(np.int32)
         tiles = VdbTiles(corners, np.full(512, 128, np.int32), np.ones(512, np.float32), np.ones(512, bool))
         huge = replace(still, name="huge", tiles=tiles)
-        write_vdb(tmp_path / f"hot_{frame}.vdb", [*blob(8.0, ("density",)), heat(), still, both, huge])
+        hot = VdbGrid.from_dense("hot", np.full((8, 8, 8), 1e38, np.float32), transform=still.transform)
+        write_vdb(tmp_path / f"hot_{frame}.vdb", [*blob(8.0, ("density",)), heat(), still, both, huge, hot])
     with pytest.raises((ConfigError, DataError)) as caught:
         data = dataset(tmp_path, tmp_path, channels=names)
         assert data.points is not None

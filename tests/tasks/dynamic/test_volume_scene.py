@@ -262,6 +262,11 @@ def test_a_grid_by_another_name_and_one_of_vectors(hot: Path, tmp_path: Path) ->
     write_vdb(hot / "ball_1.vdb", [vector])
     with pytest.raises(DataError, match=r"ball_1\.vdb: grid 'density' has 3 channels; expected 1"):
         dataset(hot, tmp_path)
+    only = tmp_path / "only"
+    only.mkdir()
+    write_vdb(only / "wind_1.vdb", [replace(vector, name="vel")])
+    with pytest.raises(DataError, match=r"wind_1\.vdb: grid 'vel' has 3 channels; expected 1"):
+        dataset(only, tmp_path, grids={"density": "vel"})
 
 
 def sphere_level_set(radius: float, width: float = 1.5) -> VdbGrid:

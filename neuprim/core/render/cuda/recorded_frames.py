@@ -54,7 +54,7 @@ class FrameRecorder:
         self._capacity: FrameCapacity | None = None
         self._graphs = GraphRecorder(where, "frames")
         self._programs: dict[Any, _Program | None] = {}  # None: seen once
-        self._memory: tuple[int, ...] = ()
+        self._memory: tuple[Any, ...] = ()
         self._turn = threading.Lock()
 
     def render(
@@ -66,9 +66,9 @@ class FrameRecorder:
         A frame is recorded when its intrinsics, settings and shapes repeat and :meth:`observe` has set the array sizes.
         """
         with self._turn:
-            memory = tuple(value.data_ptr() for value in model.params.values())
+            memory = tuple((value.data_ptr(), value.shape) for value in model.params.values())
             if memory != self._memory:
-                self._programs.clear()
+                self._discard_programs()
                 self._memory = memory
             lens = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
             stages = (model.density.stage, model.colour.stage)
@@ -78,7 +78,7 @@ class FrameRecorder:
             program = self._programs.get(key)
             if program is None and key in self._programs and self._capacity is not None:
                 if len(self._programs) > _MOST_PROGRAMS:
-                    self._programs.clear()
+                    self._discard_programs()
                 program = self._programs[key] = self._make_program(model, camera, conditions, settings, background)
             if program is None or self._graphs.failed:
                 self._programs.setdefault(key, None)
@@ -106,7 +106,11 @@ class FrameRecorder:
             if self._capacity is not None and self._capacity.fits(counts):
                 return
             self._capacity = FrameCapacity.around(counts, self._refused, zeros=True, least=self._capacity)
-            self._programs.clear()
+            self._discard_programs()
+
+    def _discard_programs(self) -> None:
+        self._programs.clear()
+        self._graphs.clear()
 
     def _make_program(
         self, model: Primitives, camera: Camera, conditions: Conditions, settings: RenderSettings,

@@ -235,7 +235,10 @@ def vdb_grid_sampler(grid: VdbGrid) -> Callable[[np.ndarray], np.ndarray]:
     """
     if grid.bounds is None:
         return lambda points: np.zeros((len(points), grid.channels), np.float32)
-    own = _MediumGrid.in_bricks([grid], grid.transform, grid.bounds)
+    try:
+        own = _MediumGrid.in_bricks([grid], grid.transform, grid.bounds)
+    except DataError as error:
+        raise DataError(f"grid {grid.name!r}: {error}") from None
     values = read_bricks(grid, own.first, own.bricks)
     values = values.reshape(*values.shape[:4], grid.channels)
     values[~np.isfinite(values)] = 0.0

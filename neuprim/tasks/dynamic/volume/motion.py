@@ -23,6 +23,7 @@ _PAIRS, _POINTS = 6, 4096  # pairs of frames that are compared, and points in ea
 _MATTER = 0.01  # least extinction of a point, over the largest of its frame
 _STEPS = np.geomspace(0.05, 30.0, 64)  # displacements of fast points between two frames to try, in voxels
 _FAST = 90.0  # percentile of speeds
+_OUTLIER = 10.0  # largest speed with which a primitive starts, over the speed of fast points
 _EXPLAINED = 0.1  # least part of the squared change between frames that velocities must explain
 
 
@@ -46,11 +47,24 @@ class VelocityGrid(NamedTuple):
 
     name: str
     unit: float  # world units per frame number, of a value of 1
+    fastest: float = np.inf  # value to which speeds are limited
 
     def sample(self, frame: VdbFrame, world: np.ndarray) -> np.ndarray:
-        """Return (M, 3) float64 velocities at ``world`` (M, 3), world units per frame number; 0 without the grid."""
-        found = sample_vdb_frame(frame, [self.name], world)
-        return self.unit * found.get(self.name, np.zeros((len(world), 3))).astype(np.float64)
+        """Return (M, 3) float64 velocities at ``world`` (M, 3), world units per frame number; 0 without the grid.
+
+        Raises:
+            DataError: the file or the grid cannot be read, or the grid has no vectors.
+        """
+        try:
+            found = sample_vdb_frame(frame, [self.name], world)
+        except DataError as error:
+            raise DataError(f"{error}. scene.velocity=none ignores the grid of velocities") from error
+        values = found.get(self.name, np.zeros((len(world), 3))).astype(np.float64)
+        if values.shape[1] != 3:
+            what = f"grid {self.name!r} has {values.shape[1]} number per voxel"
+            raise DataError(f"{frame.path}: {what}; expected 3, as in other frames (or scene.velocity=none)")
+        speeds = np.linalg.norm(values, axis=1, keepdims=True)
+        return self.unit * values * np.minimum(1.0, self.fastest / np.maximum(speeds, 1e-300))
 
 
 def find_velocity_grid(frames: Sequence[VdbFrame], wanted: str) -> str | None:
@@ -75,14 +89,15 @@ def find_velocity_grid(frames: Sequence[VdbFrame], wanted: str) -> str | None:
 
 def measure_velocity_grid(frames: Sequence[VdbFrame], reader: GridReader, name: str | None) -> VelocityGrid | None:
     """Measure the unit of the grid of velocities ``name``, and tell the user; None without a grid or a unit."""
-    if name is None:
+    if name is None or len(frames) < 2:
         return None
-    folder, unit = frames[0].path.parent, _measure_velocity_unit(frames, reader, name)
-    if unit is None:
+    folder, found = frames[0].path.parent, _measure_velocity_unit(frames, reader, name)
+    if found is None:
         warn_once(f"{folder}: grid {name!r} does not explain how the density moves; primitives start at rest")
         return None
-    warn_once(f"{folder}: primitives start with the velocities of grid {name!r}: 1 is {unit:.3g} world units per frame")
-    return VelocityGrid(name, unit)
+    unit = f"1 is {found.unit:.3g} world units per frame"
+    warn_once(f"{folder}: primitives start with the velocities of grid {name!r}: {unit}")
+    return found
 
 
 class _MovingPoints(NamedTuple):
@@ -99,11 +114,10 @@ class _MovingPoints(NamedTuple):
         return float(np.square(self.after(self.places + unit * self.velocities) - self.before).sum())
 
 
-def _measure_velocity_unit(frames: Sequence[VdbFrame], reader: GridReader, name: str) -> float | None:
-    """Return the unit of :class:`VelocityGrid`; None if velocities explain too little of the change between frames."""
+def _measure_velocity_unit(frames: Sequence[VdbFrame], reader: GridReader, name: str) -> VelocityGrid | None:
+    """Return the grid with its unit; None if velocities explain too little of the change between frames."""
     moving = list[_MovingPoints]()
-    chosen = np.unique(np.linspace(0, len(frames) - 2, _PAIRS).round().astype(int)) if len(frames) > 1 else ()
-    for i in chosen:
+    for i in np.unique(np.linspace(0, len(frames) - 2, _PAIRS).round().astype(int)):
         if (found := _find_moving_points(frames[i], frames[i + 1], reader, name)) is not None:
             moving.append(found)
     speeds = np.concatenate([np.linalg.norm(m.velocities, axis=1) for m in moving] or [np.zeros(1)])
@@ -113,7 +127,9 @@ def _measure_velocity_unit(frames: Sequence[VdbFrame], reader: GridReader, name:
     units = _STEPS * min(m.voxel for m in moving) / fast
     changes = [sum(m.change(unit) for m in moving) for unit in (0.0, *units)]
     best = int(np.argmin(changes[1:]))
-    return float(units[best]) if changes[1 + best] < (1 - _EXPLAINED) * changes[0] else None
+    if not changes[1 + best] < (1 - _EXPLAINED) * changes[0]:
+        return None
+    return VelocityGrid(name, float(units[best]), _OUTLIER * fast)
 
 
 def _find_moving_points(first: VdbFrame, second: VdbFrame, reader: GridReader, name: str) -> _MovingPoints | None:
@@ -122,8 +138,9 @@ def _find_moving_points(first: VdbFrame, second: VdbFrame, reader: GridReader, n
     velocity = VelocityGrid(name, float(second.number - first.number))
     if before is None or after is None or not len(before.values):
         return None
-    largest = float(before.values.max())
-    leaf, *inside = np.nonzero(before.masks & (before.values > _MATTER * largest))
+    values = np.where(np.isfinite(before.values), before.values, 0.0)
+    largest = float(values.max())
+    leaf, *inside = np.nonzero(before.masks & (values > _MATTER * largest))
     if not (largest > 0 and len(leaf)):
         return None
     random = np.random.default_rng(first.number)
@@ -132,5 +149,5 @@ def _find_moving_points(first: VdbFrame, second: VdbFrame, reader: GridReader, n
     places = index @ before.transform[:3, :3].T + before.transform[:3, 3]
     sampler = vdb_grid_sampler(after)
     voxel = float(np.linalg.norm(before.transform[:3, :3], axis=0).min())
-    values = before.values[(leaf, *inside)][rows] / largest
-    return _MovingPoints(places, velocity.sample(first, places), values, lambda at: sampler(at)[:, 0] / largest, voxel)
+    shares = values[(leaf, *inside)][rows] / largest
+    return _MovingPoints(places, velocity.sample(first, places), shares, lambda at: sampler(at)[:, 0] / largest, voxel)

@@ -133,6 +133,9 @@ def find_volume_grids(frames: Sequence[VdbFrame], chosen: Mapping[str, str]) -> 
     return GridReader(names, level_sets=frozenset(level_sets & set(chosen.values())))
 
 
+_LARGEST_CHANNEL = 1e15  # squares are float32
+
+
 def measure_vdb_channels(
     frames: Sequence[VdbFrame], names: Sequence[str], progress: Callable[[str, float], None]
 ) -> dict[str, ChannelRange]:
@@ -154,6 +157,9 @@ def measure_vdb_channels(
                 raise DataError(f"{frame.path}: {what}; expected {width}, as in earlier frames")
             values = grid.active_values()
             values = values[np.isfinite(values)]
+            if np.abs(values).max(initial=0.0) > _LARGEST_CHANNEL:
+                what = f"grid {grid.name!r} has values up to {np.abs(values).max():.3g}"
+                raise DataError(f"{frame.path}: {what}; expected at most {_LARGEST_CHANNEL:.0e}")
             largest = max(largest, float(np.abs(values).max(initial=0.0)))
             found[grid.name] = ChannelRange(largest, width, min(lowest, float(values.min(initial=0.0))))
     for name in names:
@@ -199,6 +205,9 @@ def survey_volume_frames(
         progress("looking through the frames", i / len(frames))
         extents[frame.number] = GridExtent(0.0, 0.0, None)
         for meaning, grid in reader.read(frame.path).items():
+            if meaning == reader.extinction and grid.channels != 1:
+                what = f"grid {reader.names[meaning]!r} has {grid.channels} channels"
+                raise DataError(f"{frame.path}: {what}; expected 1")
             box = grid.world_bounds()
             if box is None or meaning not in histograms or grid.channels != 1:
                 continue

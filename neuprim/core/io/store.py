@@ -146,6 +146,8 @@ class Store:
         other files.
         """
         if self.is_local:  # the store's folder must exist: creating a lost mount would hide it
+            if (self.path / name / last).is_file():
+                return  # a faster process stored it, and removed the draft of this one
             fill_folder(self.path / name, write, lambda folder: (folder / last).is_file())
             for draft in self.path.glob(f".{name}-*"):  # of killed or slower processes
                 shutil.rmtree(draft, ignore_errors=True)

@@ -152,6 +152,21 @@ def test_a_moments_absence_is_survived_and_other_errors_are_not_tried_twice(
     assert calls.count("full") == 1
 
 
+def test_what_a_faster_process_stored_is_not_written_again(tmp_path: Path) -> None:
+    store, calls = Store.local(tmp_path / "s"), []
+    store.prepare()
+
+    def fill(draft: Path) -> None:
+        calls.append(draft)
+        (draft / "last").write_text("mine")
+        if len(calls) == 1:  # meanwhile another process does the same, and removes drafts
+            store.write_folder("f", fill, "last")
+            raise FileNotFoundError(2, "No such file or directory", str(draft / "more"))
+
+    store.retry(lambda: store.write_folder("f", fill, "last"), pytest.fail)
+    assert len(calls) == 2 and [path.name for path in store.path.iterdir()] == ["f"]
+
+
 WANTED = {"a": (np.float32, (None, 3)), "b": (np.float64, ())}
 
 

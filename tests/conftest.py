@@ -26,7 +26,8 @@ SLOW = 3600.0
 FIRST = (
     "numerics/test_equivalence.py", "cli/test_torchrun.py", "plugins/test_new_task.py",
     "runs/launch/test_launch_processes.py", "search/test_target_run.py", "search/test_ablation.py",
-    "conformance/test_checks.py", "webpage/test_page_person.py", "viewer/test_live_browser.py",
+    "conformance/test_checks.py", "webpage/test_page_person.py", "webpage/test_page_exact.py",
+    "viewer/test_live_browser.py",
 )  # fmt: skip
 """Files with long tests, which start first so that no worker ends alone. While one worker compiles the kernels of the
 first file, another compiles those of runs; the other files of numerics find them compiled."""

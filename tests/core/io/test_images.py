@@ -268,6 +268,13 @@ def test_a_data_window_around_what_is_visible(tmp_path: Path) -> None:
         assert np.array_equal(pixels, values[y0 : y1 + 1, x0 : x1 + 1].numpy())
 
 
+def test_dwaa_takes_no_colours_beyond_half_floats(tmp_path: Path) -> None:
+    bright = ExrChannel(torch.full((4, 4), 1e5))
+    write_exr_layers(tmp_path / "a.exr", {"depth.Z": bright}, compression="dwaa")
+    with pytest.raises(DataError, match=r"channel fire\.R: value 100000 does not fit the compression dwaa"):
+        write_exr_layers(tmp_path / "a.exr", {"fire.R": bright}, compression="dwaa")
+
+
 @pytest.mark.parametrize("name", COMPRESSIONS)
 def test_compressions_lose_nothing_but_dwaa(tmp_path: Path, name: str) -> None:
     ramp = torch.linspace(0, 1, 64).expand(64, 64) + 0.05 * torch.rand(64, 64)

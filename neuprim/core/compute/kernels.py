@@ -138,7 +138,7 @@ def _jit(**options: Any) -> Callable[[Any], Any]:
 
 
 _INLINE: Any = {"error_model": "numpy", "forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-"""Options of functions that only kernels call. Without wrappers for other callers, kernels compile a fifth faster."""
+"""Options of functions that only kernels call. Without wrappers for other callers, kernels compile faster."""
 
 inline = njit(fastmath=FAST, **_INLINE)
 """Decorator of functions that pixel kernels call. ``forceinline`` makes results bit-identical whether the kernel comes

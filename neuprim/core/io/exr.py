@@ -211,7 +211,7 @@ def write_exr_layers(
 
     Args:
         channels: channel name, with the prefix of its layer -> channel. All channels have the same size. Values of half
-            floats are at most 65504.
+            floats, and of colours with dwaa, are at most 65504.
         attributes: header attributes: text, numbers, float32 arrays of shape (2,), (3,) or (4, 4), lists of floats.
         compression: name in :data:`COMPRESSIONS`.
         visible: (H, W) bool; the file stores only the smallest rectangle that contains these pixels, its data window.

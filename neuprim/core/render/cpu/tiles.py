@@ -109,7 +109,7 @@ def _reached_tiles(start, stop, projected, across, first):  # type: ignore[no-un
                     lo, hi = int(x0) // P.TILE, int(x1) // P.TILE + 1
                 if n + hi - lo > tiles.shape[0]:
                     grown = np.empty(2 * (n + hi - lo), np.int32)
-                    for k in range(n):  # numba compiles an assignment of slices 2 s longer
+                    for k in range(n):  # numba compiles an assignment of slices much longer
                         grown[k] = tiles[k]
                     tiles = grown
                 for tx in range(lo, hi):

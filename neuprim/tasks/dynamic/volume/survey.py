@@ -157,11 +157,11 @@ def measure_vdb_channels(
                 raise DataError(f"{frame.path}: {what}; expected {width}, as in earlier frames")
             values = grid.active_values()
             values = values[np.isfinite(values)]
-            if np.abs(values).max(initial=0.0) > _LARGEST_CHANNEL:
-                what = f"grid {grid.name!r} has values up to {np.abs(values).max():.3g}"
+            most = float(np.abs(values).max(initial=0.0))
+            if most > _LARGEST_CHANNEL:
+                what = f"grid {grid.name!r} has values up to {most:.3g}"
                 raise DataError(f"{frame.path}: {what}; expected at most {_LARGEST_CHANNEL:.0e}")
-            largest = max(largest, float(np.abs(values).max(initial=0.0)))
-            found[grid.name] = ChannelRange(largest, width, min(lowest, float(values.min(initial=0.0))))
+            found[grid.name] = ChannelRange(max(largest, most), width, min(lowest, float(values.min(initial=0.0))))
     for name in names:
         if name not in found or not found[name].largest:
             problem = "the grid is 0 in all frames" if name in found else "no frame has such a grid"

@@ -108,6 +108,7 @@ class TrainingControls:
         gui, progress = session.client.gui, training.progress
         self._text = gui.add_text("training", progress.text, disabled=True)
         self._bar = gui.add_progress_bar(100 * progress.fraction)
+        self._shown_paused = training.paused
         self._pause = gui.add_checkbox("pause", training.paused)
         self._pause.on_update(lambda _: training.pause(bool(self._pause.value)))
         hint = "stop ends it as Ctrl-C does: it can be resumed"
@@ -122,8 +123,8 @@ class TrainingControls:
         """Show the current progress and PSNR curves."""
         progress = self.training.progress
         self._text.value, self._bar.value = progress.text, 100 * progress.fraction
-        if self._pause.value != self.training.paused:
-            self._pause.value = self.training.paused
+        if self._shown_paused != self.training.paused:  # comparing its value could undo a click
+            self._shown_paused = self._pause.value = self.training.paused
         for name, curve in progress.curves.items():
             if len(curve) > self._sent[name]:
                 self._sent[name] = len(curve)

@@ -114,11 +114,11 @@ def test_a_person_looks_at_a_training(tmp_path: Path, monkeypatch: pytest.Monkey
         tab.until(lambda: page.locator(".uplot").count() == 1 and live.progress.step > 100, "a curve")
         page.get_by_label("pause").click()
         tab.until(lambda: live.paused, "the pause")
-        step = live.progress.step
-        page.get_by_text("one step").click()
-        tab.until(lambda: live.progress.step == step + 1, "one more step")
         page.get_by_text("checkpoint", exact=True).click()
         tab.until((tmp_path / HOSTILE / "checkpoint.safetensors").exists, "a checkpoint")
+        step = live.progress.step  # of the checkpoint: the step during which the pause was requested has ended
+        page.get_by_text("one step").click()
+        tab.until(lambda: live.progress.step == step + 1, "one more step")
 
         page.get_by_role("tab", name="View").click()
         tab.until(lambda: tab.picture().std() > 15, "a picture of the model")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import random
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -178,6 +179,33 @@ def test_a_checkpoint_now_and_a_stop_that_can_be_resumed(scene: Path, tmp_path: 
     trained(compose(words(scene, tmp_path / "stopped", STEPS, "resume=true")))
     first, second = state(alone)[1], state(stopped)[1]
     assert all(torch.equal(value, second[name]) for name, value in first.items())
+
+
+def test_a_pause_is_kept_while_numbers_are_updated(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """viser stores the value of the box first and calls the viewer a moment later, on another thread."""
+    monkeypatch.setattr(sessions, "_REDRAW_SECONDS", 0.0)
+    monkeypatch.setattr(sessions, "_REDRAW_SHARE", 0.0)
+    monkeypatch.setattr("neuprim.viewer.view._UPDATE_SECONDS", 0.0)
+    pause = LiveTraining.pause
+
+    def pause_late(live: LiveTraining, paused: bool) -> None:
+        time.sleep(0.3)
+        pause(live, paused)
+
+    def look(live: LiveTraining, page: Visitor) -> None:
+        until(page, lambda: len(page.pictures()) > 0)
+        page.set("pause", False)
+        until(page, lambda: live.progress.step > 3)
+        monkeypatch.setattr(LiveTraining, "pause", pause_late)
+        page.set("pause", True)
+        page.hear(2.0)
+        kept = live.paused
+        live.stop()
+        assert kept
+
+    Watched(compose(words(scene, tmp_path / "out", 100_000)), look)
 
 
 def test_a_picture_that_fails_ends_no_training(

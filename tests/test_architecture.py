@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import functools
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -16,14 +17,16 @@ FILES = sorted(ROOT.rglob("*.py"))
 LONGEST = 460
 
 
-TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
+@functools.cache  # not when the file is imported, which every worker does
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def imported(path: Path) -> set[str]:
     """Absolute names of all modules a file imports, anywhere in it, type-checking blocks and functions included."""
     package = (ROOT.name, *path.relative_to(ROOT).parent.parts)
     names: set[str] = set()
-    for node in ast.walk(TREES[path]):
+    for node in ast.walk(tree(path)):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -37,7 +40,7 @@ def imported(path: Path) -> set[str]:
 
 def places(paths: list[Path], wrong: Callable[[ast.AST], bool]) -> list[str]:
     """Where a file has what is wrong."""
-    found = [(path, node) for path in paths for node in ast.walk(TREES[path]) if wrong(node)]
+    found = [(path, node) for path in paths for node in ast.walk(tree(path)) if wrong(node)]
     return [f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 0)}" for path, node in found]
 
 
@@ -214,14 +217,14 @@ def test_every_property_of_a_parameter_decides_something() -> None:
     read: set[str] = set()
     for path in FILES:
         if path.is_relative_to(ROOT / "core") and path.name != "schema.py":
-            called = {id(node.func) for node in ast.walk(TREES[path]) if isinstance(node, ast.Call)}
-            attributes = [node for node in ast.walk(TREES[path]) if isinstance(node, ast.Attribute)]
+            called = {id(node.func) for node in ast.walk(tree(path)) if isinstance(node, ast.Call)}
+            attributes = [node for node in ast.walk(tree(path)) if isinstance(node, ast.Attribute)]
             read |= {n.attr for n in attributes if isinstance(n.ctx, ast.Load) and id(n) not in called}
     assert {field.name for field in dataclasses.fields(ParameterSpec)} - read - {"init"} == set()
 
 
 def test_every_module_says_what_it_is_for() -> None:
-    assert [f for f, tree in TREES.items() if tree.body and not ast.get_docstring(tree)] == []
+    assert [file for file in FILES if tree(file).body and not ast.get_docstring(tree(file))] == []
 
 
 def test_nothing_unpickles_or_evaluates() -> None:

@@ -9,7 +9,10 @@ the built-in plugin, even if other packages register the name, too.
 
 from __future__ import annotations
 
+import functools
 import importlib.util
+import os
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import metadata
@@ -203,20 +206,8 @@ class PluginGroup(Generic[T]):
 
         If sys.path has several copies of a package, only the entry points of the copy that Python imports are listed.
         """
-        found, packages = [], set()
-        for dist in metadata.distributions():
-            try:
-                entries = [entry for entry in dist.entry_points if entry.group == self.entry_points]
-                if not entries:
-                    continue
-                name, version = str(dist.metadata["Name"] or ""), str(dist.metadata["Version"] or "")
-                hidden = metadata.distribution(name).locate_file("") != dist.locate_file("")
-            except Exception:  # a half-removed package must not hide the others
-                continue
-            if hidden or canonicalize_name(name) in packages:  # a copy further down sys.path, which is not imported
-                continue
-            packages.add(canonicalize_name(name))
-            found += [(PluginInfo(entry.name, name, version, entry.value), entry) for entry in entries]
+        registered = _registered_entry_points(tuple((path, _modification_time(path)) for path in sys.path))
+        found = [(info, entry) for info, entry in registered if entry.group == self.entry_points]
         return sorted(found, key=lambda pair: (pair[0].name, not pair[0].built_in, pair[0].distribution))
 
     def _load(self, info: PluginInfo, entry: metadata.EntryPoint) -> T:
@@ -246,6 +237,34 @@ class PluginGroup(Generic[T]):
         if (own := self.name_of(spec)) != info.name:
             raise PluginError(f"{who}: its {class_name} is named {own!r}; expected {info.name!r}, as the entry point")
         return spec  # type: ignore[no-any-return]
+
+
+def _modification_time(folder: str) -> int:
+    """Return when an entry of sys.path last changed, in nanoseconds; 0 if it does not exist."""
+    try:
+        return os.stat(folder or ".").st_mtime_ns
+    except OSError:
+        return 0
+
+
+@functools.lru_cache(maxsize=1)  # reading it all takes 7 ms with 100 packages
+def _registered_entry_points(path: tuple[tuple[str, int], ...]) -> list[tuple[PluginInfo, metadata.EntryPoint]]:
+    """List the entry points of all groups for a state of sys.path, given by its entries and when each last changed."""
+    found, packages = [], set()
+    for dist in metadata.distributions():
+        try:
+            entries = [entry for entry in dist.entry_points if entry.group.startswith(f"{BUILT_IN}.")]
+            if not entries:
+                continue
+            name, version = str(dist.metadata["Name"] or ""), str(dist.metadata["Version"] or "")
+            hidden = metadata.distribution(name).locate_file("") != dist.locate_file("")
+        except Exception:  # a half-removed package must not hide the others
+            continue
+        if hidden or canonicalize_name(name) in packages:  # a copy further down sys.path, which is not imported
+            continue
+        packages.add(canonicalize_name(name))
+        found += [(PluginInfo(entry.name, name, version, entry.value), entry) for entry in entries]
+    return found
 
 
 TASKS: PluginGroup[TaskSpec] = PluginGroup("neuprim.tasks", "task", "task={}", "neuprim.core.task:TaskSpec")

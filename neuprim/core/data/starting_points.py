@@ -66,7 +66,9 @@ def hull_surface(
     grid = _carve_voxels(_refine_voxels(grid, _COARSE), silhouettes, 0.87, seen_views, wrong_views)
     # a larger reach than 0.25 makes the hull too large, a smaller one makes holes
     grid = _carve_voxels(_refine_voxels(grid, resolution), silhouettes, 0.25, seen_views, wrong_views)
-    core = -F.max_pool3d(-F.pad(grid.full[None].float(), (1,) * 6), 3, stride=1)[0] > 0.5
+    core = F.pad(grid.full, (1,) * 6)  # whose 26 neighbours are full, too
+    for axis, n in enumerate(grid.full.shape):
+        core = core.narrow(axis, 0, n) & core.narrow(axis, 1, n) & core.narrow(axis, 2, n)
     return grid.centers((grid.full & ~core).nonzero()).float(), grid.voxel
 
 

@@ -25,10 +25,8 @@ EDGES = (0, 1, 2)  # supported exponents p
 
 NORMS = (2.0, 4 / 3, 16 / 15)  # N_p: the integral of (1 - u^2)^p over [-1, 1]. numba freezes them into kernels
 
-_SERIES_BELOW, _TERMS = (
-    2.0,
-    14,
-)  # upward recursion loses digits as z^-n; the series' last term is below 1e-17 of the first
+_SERIES_BELOW = 2.0  # below, upward recursion loses digits as z^-n
+_TERMS = 14  # of the series; the last term is below 1e-17 of the first
 
 
 def edge_weight(square: Tensor, edge: int) -> Tensor:
@@ -60,14 +58,13 @@ def spherical_bessel(z: Tensor, last: int) -> list[Tensor]:
     for n in range(1, last):
         j.append((2 * n + 1) / safe * j[n] - j[n - 1])
     near = torch.where(small, z, torch.zeros_like(z))
-    half_square, power, found = near * near / 2, torch.ones_like(z), []
+    one, half_square = torch.ones_like(z), near * near / 2
+    power, found = one, []
     for n in range(last + 1):
-        term = power
-        total = term
-        for k in range(1, _TERMS):
-            term = -term * half_square / (k * (2 * n + 2 * k + 1))
-            total = total + term
-        found.append(torch.where(small, total, j[n]))
+        series = one
+        for k in range(_TERMS - 1, 0, -1):
+            series = torch.addcmul(one, half_square, series, value=-1 / (k * (2 * n + 2 * k + 1)))
+        found.append(torch.where(small, power * series, j[n]))
         power = power * near / (2 * n + 3)
     return found
 

@@ -96,12 +96,17 @@ def render(
     seen = frame_rays(camera, lowered.geometry, frame.center, settings.near_plane)
     channels = lowered.colour.channels
     stats = RenderStats("reference", count)
+    empty = torch.zeros(_BLOCK, _BLOCK, channels + 2, dtype=torch.float64)
+    empty[..., channels] = 1  # transmittance
     rows_of_blocks = []
     for y0 in range(0, camera.height, _BLOCK):
         line = []
         for x0 in range(0, camera.width, _BLOCK):
             h, w = min(_BLOCK, camera.height - y0), min(_BLOCK, camera.width - x0)
             rays, touched = seen.block(y0, x0, h, w)
+            if not len(touched) and not torch.is_grad_enabled():  # as most blocks of shadow maps
+                line.append(empty[:h, :w])
+                continue
             ys, xs = torch.meshgrid(torch.arange(y0, y0 + h), torch.arange(x0, x0 + w), indexing="ij")
             pixels = (ys * camera.width + xs).reshape(-1)
             out = _composite_ray_block(lowered, frame, rays, touched, pixels, channels, settings, stats)

@@ -71,7 +71,7 @@ def check_points(cloud: PointCloud, count: int, dataset: Dataset) -> None:
         raise DatasetError(f"{where}: found {found} points; expected at most {count}")
     _check_finite_dataset_tensor(f"{where}: means", cloud.means, (found, 3))
     _check_finite_dataset_tensor(f"{where}: colors", cloud.colors, (found, dataset.channels))
-    for name, columns in (("axes", (3,)), ("quats", (4,)), ("alphas", ()), ("deviations", (3,))):
+    for name, columns in (("axes", (3,)), ("quats", (4,)), ("alphas", ()), ("deviations", (3,)), ("velocities", (3,))):
         if getattr(cloud, name) is not None:
             _check_finite_dataset_tensor(f"{where}: {name}", getattr(cloud, name), (found, *columns))
     for name, value in cloud.conditions.items():

@@ -141,6 +141,7 @@ def test_conditions_that_the_task_declares(value: Any, text: str) -> None:
 
 POINTS: dict[str, dict[str, Any]] = {
     "two: starting points: colors is float32 (4, 3); expected float32 (5, 3)": {"colors": torch.zeros(4, 3)},
+    "two: starting points: velocities is float32 (5, 2); expected float32 (5, 3)": {"velocities": torch.zeros(5, 2)},
     "means is float32 (5, 2); expected float32 (5, 3)": {"means": torch.zeros(5, 2)},
     "means: found 15 values that are NaN or infinite": {"means": torch.full((5, 3), float("nan"))},
     "found 7 points; expected at most 6": {"means": torch.zeros(7, 3)},

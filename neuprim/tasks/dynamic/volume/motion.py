@@ -96,7 +96,7 @@ def measure_velocity_grid(frames: Sequence[VdbFrame], reader: GridReader, name: 
         warn_once(f"{folder}: grid {name!r} does not explain how the density moves; primitives start at rest")
         return None
     unit = f"1 is {found.unit:.3g} world units per frame"
-    warn_once(f"{folder}: primitives start with the velocities of grid {name!r}: {unit}")
+    warn_once(f"{folder}: primitives that can move start with the velocities of grid {name!r}: {unit}")
     return found
 
 

@@ -147,14 +147,17 @@ def frames_to_times(
 def frame_interval(header: Mapping[str, Any], times: Iterable[float]) -> float | None:
     """Return the time between two frames, in units of the condition "time"; None if it is unknown.
 
+    If all ``times`` are those of source frames, the result is the time between two source frames. Otherwise, e.g. in
+    slow motion, it is the mean distance between neighbouring ``times``.
+
     Args:
-        header: header of the model. If the header names no source frames, the result is the mean distance between
-            neighbouring ``times``.
+        header: header of the model, which may name source frames.
         times: times of the frames that are rendered or exported.
     """
     frames, ordered = source_frames(header), sorted(set(times))
-    if frames is not None and frames[1] > frames[0]:
-        return 1 / (frames[1] - frames[0])
+    if frames is not None and (gaps := frames[1] - frames[0]) > 0:
+        if len(ordered) < 2 or all(abs(time * gaps - round(time * gaps)) < 0.01 for time in ordered):
+            return 1 / gaps
     return (ordered[-1] - ordered[0]) / (len(ordered) - 1) if len(ordered) > 1 else None
 
 

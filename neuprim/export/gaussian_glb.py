@@ -7,7 +7,7 @@ The file has one primitive of mode POINTS with these attributes, all float32 (K 
 * ``K:SH_DEGREE_d_COEF_n``: SH coefficients of degrees 0 to 3, RGB
 * ``COLOR_0``: colour of degree 0 and opacity, for viewers that show only points
 
-Coordinates are those of the run's data, rotated from z up to glTF's y up, unless the data have y up. The colour space
+Coordinates are those of the run's data, rotated about x to glTF's y up, unless the data have y up. The colour space
 is ``lin_rec709_display`` for models of linear images, else ``srgb_rec709_display``. The Gaussians are fitted, and their
 error is measured, as in :mod:`neuprim.export.gaussian_ply`.
 """
@@ -27,7 +27,7 @@ from neuprim.core.io.files import atomic_path
 from neuprim.core.model import sh
 from neuprim.core.task import API_VERSION
 from neuprim.export.gaussian_ply import OPTIONS, ExportedGaussians, fit_exported_gaussians
-from neuprim.export.shared import Z_UP_TO_GLTF, y_is_up
+from neuprim.export.shared import AXES_TO_GLTF, closest_up_axis, gltf_up_notes
 
 _NAME = "KHR_gaussian_splatting"
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
@@ -36,17 +36,14 @@ _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 def _write_gaussian_glb(job: ExportJob) -> ExportReport:
     fitted = fit_exported_gaussians(job)
     matrix = job.run.world.world_from_scene.double()
-    turned = not y_is_up(matrix[:3, :3] @ job.run.world.up)
-    if turned:
-        matrix = torch.from_numpy(Z_UP_TO_GLTF) @ matrix
+    up = closest_up_axis(matrix[:3, :3] @ job.run.world.up)
+    matrix = torch.from_numpy(AXES_TO_GLTF[up]) @ matrix
     attributes, offset = _gaussian_attributes(fitted, matrix)
     linear = job.run.channels.color_space == "linear"
     data = _pack_glb(attributes, offset, "lin_rec709_display" if linear else "srgb_rec709_display")
     with atomic_path(job.out) as temporary:
         temporary.write_bytes(data)
-    notes = [*fitted.notes, f"glTF extension {_NAME}; degree 3 harmonics"]
-    if turned:
-        notes.append("turned from z up to glTF's y up; Blender and others turn it back")
+    notes = [*fitted.notes, f"glTF extension {_NAME}; degree 3 harmonics", *gltf_up_notes(up)]
     return ExportReport((job.out,), False, fitted.errors, tuple(notes))
 
 

@@ -1,9 +1,9 @@
 """Export format ``gaussian-usd``: one Gaussian per primitive as USD's ParticleField3DGaussianSplat; lossy.
 
 Several frames become time samples of one prim, at the frame numbers of the model's source. Coordinates are those of the
-run's data; the stage states the upward axis. Positions are float32, so the prim's translation holds the offset of large
-coordinates. Opacities are 0 to 1, and SH coefficients of degree 3 have the conventions of 3D Gaussian splatting. The
-Gaussians are fitted, and their error is measured, as in :mod:`neuprim.export.gaussian_ply`.
+run's data; the stage states the upward axis, and one metre per unit. Positions are float32, so the prim's translation
+holds the offset of large coordinates. Opacities are 0 to 1, and SH coefficients of degree 3 have the conventions of 3D
+Gaussian splatting. The Gaussians are fitted, and their error is measured, as in :mod:`neuprim.export.gaussian_ply`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from neuprim.core.errors import BackendUnavailable
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport
 from neuprim.core.task import API_VERSION
 from neuprim.export.gaussian_ply import OPTIONS, ExportedGaussians, fit_exported_gaussians
-from neuprim.export.shared import y_is_up
+from neuprim.export.shared import closest_up_axis, upside_down_usd_notes
 
 _REACH = 3.0  # standard deviations that the stated extent contains
 
@@ -31,7 +31,9 @@ def _write_gaussian_usd(job: ExportJob) -> ExportReport:
     numbers = frame_numbers(job.run.header, frames)
     matrix = job.run.world.world_from_scene.double()
     stage = Usd.Stage.CreateNew(str(job.out))
-    UsdGeom.SetStageUpAxis(stage, "Y" if y_is_up(matrix[:3, :3] @ job.run.world.up) else "Z")
+    up = closest_up_axis(matrix[:3, :3] @ job.run.world.up)
+    UsdGeom.SetStageUpAxis(stage, up[-1].upper())
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)  # as in Blender, Houdini and OpenVDB; USD's default is a centimetre
     prim = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/gaussians")
     stage.SetDefaultPrim(prim.GetPrim())
     prim.AddTranslateOp().Set(Gf.Vec3d(*matrix[:3, 3].tolist()))
@@ -59,7 +61,7 @@ def _write_gaussian_usd(job: ExportJob) -> ExportReport:
     stage.GetRootLayer().Save()
     if len(frames) > 1:
         notes.insert(0, f"{len(frames)} frames as time samples; of frame {numbers[0]}:")
-    return ExportReport((job.out,), False, errors, tuple(notes))
+    return ExportReport((job.out,), False, errors, (*notes, *upside_down_usd_notes(up)))
 
 
 def _set_gaussians(prim: Any, fitted: ExportedGaussians, world: World, when: Any) -> None:

@@ -38,12 +38,14 @@ from neuprim.core.render import render
 from neuprim.core.task import API_VERSION
 from neuprim.core.volumes.density_grid import density_grid
 from neuprim.export.shared import (
-    Z_UP_TO_GLTF,
+    AXES_TO_GLTF,
     ExportHarmonics,
     choose_export_views,
+    closest_up_axis,
     find_export_box,
     find_export_rgb_channels,
     fit_export_harmonics,
+    gltf_up_notes,
 )
 
 OPTIONS = {
@@ -56,8 +58,7 @@ OPTIONS = {
     "keep": (0.01, "least area of a piece, as a part of the largest one's"),
     "up": (
         "auto",
-        "upward axis of the data, z or y; only .glb files are turned by it (auto: that of a mesh that was "
-        "fitted, else z)",
+        "upward axis of the data, z, y, -z or -y; only .glb files are turned by it (auto: that of the scene)",
     ),
 }
 _SUFFIXES = (".glb", ".ply", ".obj")
@@ -79,9 +80,9 @@ def _write_mesh(job: ExportJob) -> ExportReport:
     import trimesh
 
     smooth, keep = job.number("smooth", 0, 4) or 0.0, job.number("keep", 0, 1) or 0.0
-    up, turn = job.choice("up", "auto", "z", "y"), job.run.world.rotation
-    if up == "auto":  # of the world's axes, the one that is the scene's z
-        up = "y" if turn is not None and float(turn[2, 1]) > 0.5 else "z"
+    up, world = job.choice("up", "auto", *AXES_TO_GLTF), job.run.world
+    if up == "auto":
+        up = closest_up_axis(world.world_from_scene[:3, :3].double() @ world.up)
     seen = fit_export_harmonics(job.run, conditions)
     job.progress("sampling the density", 0.0)
     sigma, scene_from_index = _sample_exported_density(job, conditions, job.count("grid", 8, 1024) or 192)
@@ -108,12 +109,12 @@ def _write_mesh(job: ExportJob) -> ExportReport:
     colours = torch.from_numpy(_exported_vertex_colours(job, conditions, seen, vertices, normals)).float()
     colours = channels.display_rows(colours) if rgb is None else colours[:, list(rgb)]
     iou = _compare_exported_silhouettes(job, conditions, mesh)
-    _save_mesh(mesh, colours, "srgb" if rgb is None else channels.color_space, path, up, job.run.world)
+    _save_mesh(mesh, colours, "srgb" if rgb is None else channels.color_space, path, up, world)
     notes.append(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles; {dropped} small pieces left out")
     if channels.display_text:
         notes.append(f"colours: {channels.display_text}")
-    if path.suffix.lower() == ".glb" and up == "z":
-        notes.append("turned from z up to glTF's y up; Blender and others turn it back")
+    if path.suffix.lower() == ".glb":
+        notes += gltf_up_notes(up)
     return ExportReport((path,), False, {"silhouette_iou": iou}, tuple(notes))
 
 
@@ -228,13 +229,26 @@ def _save_mesh(mesh: Any, colours: Tensor, space: str, path: Path, up: str, worl
     matrix = world.world_from_scene.numpy()
     linear, offset = np.eye(4), matrix[:3, 3]
     linear[:3, :3] = matrix[:3, :3]
-    if suffix == ".glb" and up == "z":
-        linear, offset = Z_UP_TO_GLTF @ linear, Z_UP_TO_GLTF[:3, :3] @ offset
+    if suffix == ".glb":
+        linear, offset = AXES_TO_GLTF[up] @ linear, AXES_TO_GLTF[up][:3, :3] @ offset
     if (linear != np.eye(4)).any():
         written.apply_transform(linear)
-    data: Any = _export_far_mesh(written, suffix, offset) if offset.any() else written.export(file_type=suffix[1:])
+    more: dict[str, Any] = {"tree_postprocessor": _make_unlit} if suffix == ".glb" else {}
+    data: Any = (
+        _export_far_mesh(written, suffix, offset) if offset.any() else written.export(file_type=suffix[1:], **more)
+    )
     with atomic_path(path) as temporary:
         temporary.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
+
+
+def _make_unlit(tree: dict[str, Any]) -> None:
+    """Add a material to the JSON of a glTF file: the colours hold light already, and the default material is metal."""
+    unlit = "KHR_materials_unlit"
+    tree["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0}, "extensions": {unlit: {}}}]
+    tree["extensionsUsed"] = [unlit]
+    for mesh in tree["meshes"]:
+        for primitive in mesh["primitives"]:
+            primitive["material"] = 0
 
 
 def _export_far_mesh(mesh: Any, suffix: str, offset: np.ndarray) -> Any:
@@ -244,7 +258,7 @@ def _export_far_mesh(mesh: Any, suffix: str, offset: np.ndarray) -> Any:
     if suffix == ".glb":
         scene = trimesh.Scene()
         scene.add_geometry(mesh, transform=trimesh.transformations.translation_matrix(offset))
-        return scene.export(file_type="glb")
+        return scene.export(file_type="glb", tree_postprocessor=_make_unlit)
     points = np.asarray(mesh.vertices, np.float64) + offset
     if suffix == ".obj":
         mesh.vertices = points

@@ -17,13 +17,31 @@ from neuprim.core.extensions import ExportJob, TrainedModel
 from neuprim.core.model import sh
 from neuprim.core.model.fields import Conditions
 
-Z_UP_TO_GLTF = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""(4, 4) rotation from axes with z up to glTF's axes with y up: (x, y, z) becomes (x, z, -y)."""
+AXES_TO_GLTF = {
+    "z": np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]),
+    "-z": np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]),
+    "y": np.eye(4),
+    "-y": np.diag([1.0, -1, -1, 1]),
+}
+"""Upward axis of the data -> (4, 4) rotation about x to glTF's axes, in which y is up."""
 
 
-def y_is_up(up: Tensor) -> bool:
-    """Return whether an upward direction (3,) is closer to y than to z: USD and glTF know only these axes."""
-    return abs(float(up[1])) > abs(float(up[2]))
+def closest_up_axis(up: Tensor) -> str:
+    """Return which of the axes y, z, -y and -z is closest to an upward direction (3,); USD and glTF know no x."""
+    axis = max((1, 2), key=lambda a: (abs(float(up[a])), a))
+    return ("-" if up[axis] < 0 else "") + "xyz"[axis]
+
+
+def gltf_up_notes(up: str) -> list[str]:
+    """Return a note if data with the upward axis ``up`` are turned to glTF's axes."""
+    back = "; Blender and others turn it back" if up == "z" else ""
+    return [] if up == "y" else [f"turned from {up} up to glTF's y up{back}"]
+
+
+def upside_down_usd_notes(up: str) -> list[str]:
+    """Return a note if the upward axis ``up`` of the data is -y or -z, which a USD stage cannot state."""
+    turn = f"up is {up} in the data, USD knows only y and z: turn the stage by 180 degrees about x"
+    return [turn] if up.startswith("-") else []
 
 
 _DEGREE = 3

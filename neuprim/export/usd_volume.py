@@ -8,10 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from torch import Tensor
 
 from neuprim.core.io.files import write_text
-from neuprim.export.shared import y_is_up
 
 _ASSET = """
     rel field:{prim} = </volume/{prim}>
@@ -29,7 +27,7 @@ def write_usd_volume(
     files: Mapping[int, Path],
     grids: Sequence[str],
     boxes: Sequence[np.ndarray],
-    up: Tensor,
+    up: str,
     rate: float | None,
 ) -> None:
     """Write the stage as text file ``path`` (.usda), atomically. The stage names files in its folder by relative paths.
@@ -38,11 +36,11 @@ def write_usd_volume(
         files: frame number -> .vdb file, in the folder of ``path``. With one file, the volume does not change in time.
         grids: names of the grids in every file.
         boxes: (2, 3) bounds of the frames that have any voxel, in the files' world coordinates.
-        up: (3,) upward direction in these coordinates. USD only allows y and z as upward axis;
-            the axis with the larger component is written.
+        up: upward axis in these coordinates; USD only knows y and z, so that the sign of -y and -z is left out.
         rate: frames per second; None leaves USD's default, 24.
     """
-    head = ['defaultPrim = "volume"', f'upAxis = "{"Y" if y_is_up(up) else "Z"}"']
+    # one metre per unit, as in Blender, Houdini and OpenVDB; USD's default is a centimetre
+    head = ['defaultPrim = "volume"', f'upAxis = "{up[-1].upper()}"', "metersPerUnit = 1"]
     if rate is not None:
         head += [f"framesPerSecond = {rate:g}", f"timeCodesPerSecond = {rate:g}"]
     if len(files) == 1:

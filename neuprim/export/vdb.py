@@ -46,7 +46,7 @@ from neuprim.core.volumes.density_truth import (
     measure_channel_errors,
     measure_density_errors,
 )
-from neuprim.export.shared import find_export_box
+from neuprim.export.shared import closest_up_axis, find_export_box, upside_down_usd_notes
 from neuprim.export.usd_volume import write_usd_volume
 from neuprim.export.vector_grids import choose_look, choose_velocity, sample_channels
 
@@ -177,7 +177,8 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
         )
     if job.flag("usd"):
         files = {frame.number: path for frame, path in zip(frames, paths, strict=True)}
-        up = torch.from_numpy(scene_from_world[:3, :3].T) @ job.run.world.up
+        up = closest_up_axis(torch.from_numpy(scene_from_world[:3, :3].T) @ job.run.world.up)
+        notes += upside_down_usd_notes(up)
         stage = job.out / "density.usda"
         write_usd_volume(stage, files, names, boxes, up, rate)
         paths.append(stage)

@@ -14,6 +14,7 @@ from neuprim.core.conditions import (
     FRAMES,
     conditions_per_frame,
     count_condition_frames,
+    frame_interval,
     read_conditions,
     split_conditions,
 )
@@ -161,6 +162,20 @@ def test_an_export_has_every_condition_in_each_frame() -> None:
     ):
         with pytest.raises(ConfigError, match=expected):
             conditions_per_frame(SPECS, texts, several)
+
+
+@pytest.mark.parametrize(
+    ("times", "interval"),
+    [
+        ([0.3], 0.1),
+        ([0.0, 0.2, 0.4], 0.1),  # every second source frame
+        ([0.4, 0.425, 0.45], 0.025),  # slow motion
+        ([0.4, 0.402, 0.404], 0.002),
+    ],
+)
+def test_in_slow_motion_frames_are_closer_than_those_of_the_source(times: list[float], interval: float) -> None:
+    assert frame_interval({"data": {"frames": [11, 21]}}, times) == pytest.approx(interval)
+    assert frame_interval({}, times) == (pytest.approx(times[1] - times[0]) if len(times) > 1 else None)
 
 
 # ---------------------------------------------------------------- two animations at once

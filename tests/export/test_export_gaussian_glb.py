@@ -60,7 +60,7 @@ def test_the_gaussians_of_the_ply_turned_to_y_up(tmp_path: Path) -> None:
         torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator()), dim=-1
     )
     names = [f"SH_DEGREE_{d}_COEF_{n}" for d in range(4) for n in range(2 * d + 1)]
-    turned = directions @ torch.from_numpy(shared.Z_UP_TO_GLTF[:3, :3].T)
+    turned = directions @ torch.from_numpy(shared.AXES_TO_GLTF["z"][:3, :3].T)
     got = torch.einsum(
         "pk,knc->pnc", sh.sh_basis(turned, 3), torch.from_numpy(np.stack([found[n] for n in names])).double()
     )
@@ -92,7 +92,7 @@ def test_rotations_and_sizes_are_those_of_the_covariances(tmp_path: Path) -> Non
         ).transpose(2, 0, 1)
         return R @ (sizes[:, :, None].astype(np.float64) ** 2 * R.transpose(0, 2, 1))
 
-    turn = shared.Z_UP_TO_GLTF[:3, :3]
+    turn = shared.AXES_TO_GLTF["z"][:3, :3]
     own = covariances(found["ROTATION"][:, [3, 0, 1, 2]], found["SCALE"])
     sizes = np.exp(ply.columns([f"scale_{i}" for i in range(3)]))
     wanted = turn @ covariances(ply.columns([f"rot_{i}" for i in range(4)]), sizes) @ turn.T
@@ -109,3 +109,23 @@ def test_another_reader_opens_it(tmp_path: Path) -> None:
     (points,) = scene.geometry.values()
     _, found = read_glb(path)
     np.testing.assert_allclose(points.vertices, found["POSITION"], atol=1e-6)
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.1, 1.0, 0.0), (0.0, -1.0, 0.1), (0.0, 0.2, -1.0)])
+def test_whatever_is_up_is_y_in_gltf_and_stated_in_usd(up: tuple[float, float, float], tmp_path: Path) -> None:
+    """COLMAP's scenes often have -y up, which USD cannot state."""
+    config = ["task=static", "scene=solids"]
+    run = marked.write_run(tmp_path / "run", marked.static_model(), config, data={"up": list(up)})
+    report = export_run(run, "gaussian-glb", tmp_path / "g.glb", ["size=moments", "views=orbit"])
+    _, found = read_glb(report.files[0])
+    turn = np.linalg.lstsq(marked.PLACES.numpy(), found["POSITION"], rcond=None)[0].T
+    assert (turn @ up)[1] > 0.98 and np.linalg.det(turn) == pytest.approx(1, abs=1e-2)
+    assert ("turned from" in " ".join(report.notes)) == (up[1] < 0.5)
+    pytest.importorskip("pxr", reason="needs usd-core: pip install 'neuprim[usd]'")
+    from pxr import Usd, UsdGeom
+
+    report = export_run(run, "gaussian-usd", tmp_path / "g.usda", ["size=moments", "views=orbit"])
+    stage = Usd.Stage.Open(str(report.files[0]))
+    assert UsdGeom.GetStageUpAxis(stage) == ("Y" if abs(up[1]) > abs(up[2]) else "Z")
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1 and UsdGeom.StageHasAuthoredMetersPerUnit(stage)
+    assert ("180 degrees" in " ".join(report.notes)) == (min(up[1:]) < -0.5)

@@ -190,6 +190,7 @@ def test_a_usd_stage_plays_the_files(moving: Path, tmp_path: Path) -> None:
     stage = usd.Stage.Open(str(report.files[-1]))
     span = stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetFramesPerSecond(), stage.GetTimeCodesPerSecond()
     assert span == (3, 5, 25, 25) and UsdGeom.GetStageUpAxis(stage) == "Z"
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1 and UsdGeom.StageHasAuthoredMetersPerUnit(stage)
     volume = UsdVol.Volume(stage.GetDefaultPrim())
     paths = volume.GetFieldPaths()
     assert set(paths) == {"_3_grids", "emission"}

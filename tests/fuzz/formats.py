@@ -221,6 +221,10 @@ def _images(*suffixes: str) -> Callable[[Path], None]:
     return make
 
 
+def _mask(folder: Path) -> None:
+    Image.fromarray(np.arange(12 * 16).reshape(12, 16).astype(np.uint8)).save(folder / "a.png")
+
+
 def _exr(folder: Path) -> None:
     from neuprim.core.io.exr import write_exr
 
@@ -501,7 +505,7 @@ FORMATS: dict[str, Format] = {
     "png": Format(_images("png"), _read_images, {"a.png": m.png}),
     "jpeg": Format(_images("jpg"), _read_images, {"a.jpg": m.lies(0, 400)}),
     "webp": Format(_images("webp"), _read_images, {"a.webp": m.lies(0, 100)}),
-    "mask": Format(_images("png"), _reader(_IMAGES, "read_mask_image"), {"a.png": m.png}),
+    "mask": Format(_mask, _reader(_IMAGES, "read_mask_image"), {"a.png": m.png}),
     "exr": Format(_exr, _read_images, {"a.exr": m.lies(0, 420)}),
     "environment": Format(_exr, _reader("neuprim.core.environment", "read_environment"), {"a.exr": m.lies(0, 420)}),
     "vdb": Format(_vdb, _read_vdb, {f"{name}.vdb": m.lies(0, 1500) for name in ("none", "zip", "blosc")}),

@@ -9,7 +9,7 @@ import shutil
 import struct
 import tempfile
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -54,26 +54,63 @@ def read_colmap_model(folder: Path) -> Any:
     if kind == ".bin":
         check_binary_colmap_model(folder, _lens_parameter_count)
     try:
+        stored = _stored_colmap_images(folder / f"images{kind}")
         model = pycolmap.Reconstruction(str(folder))
-        if kind == ".txt":
-            _restore_colmap_image_names(model, folder / "images.txt")
+        for number, _, name in stored:
+            if " " in name:  # COLMAP cuts names of text files off at the first blank
+                model.images[number].name = name
         for image in model.images.values():
             _ = image.name  # UnicodeDecodeError where it is no UTF-8
+        if (folder / f"frames{kind}").is_file():
+            _check_colmap_frame_poses(model, stored, folder, kind)
         return model
+    except DataError:
+        raise
     except Exception as error:  # pycolmap raises many types for inconsistent models
         raise DataError(f"{folder}: not a readable COLMAP model ({type(error).__name__}: {error})") from None
 
 
-def _restore_colmap_image_names(model: Any, path: Path) -> None:
-    """Restore image names of ``images.txt`` that contain blanks; COLMAP cuts names off at the first blank."""
-    lines = iter(path.read_text(encoding="utf-8", errors="surrogateescape").split("\n"))
+def _stored_colmap_images(path: Path) -> list[tuple[int, Sequence[Any], str]]:
+    """Return (number, pose as QW QX QY QZ TX TY TZ, name) of each image in an images file; "" for names in binary."""
+    images: list[tuple[int, Sequence[Any], str]] = []
+    if path.suffix == ".bin":
+        file = _ColmapRecordReader(path)
+        for _ in range(file.number("Q")):
+            number, *pose = struct.unpack_from("<I7d", file.data, file.at)
+            images.append((number, pose, ""))
+            _skip_image(file)
+        return images
+    lines = iter(path.read_text(encoding="utf-8-sig", errors="surrogateescape").split("\n"))
     for line in lines:
         fields = line.strip().split(maxsplit=9)
         if not fields or fields[0].startswith("#"):
             continue
-        if len(fields) == 10 and " " in fields[9]:
-            model.images[int(fields[0])].name = fields[9]
-        next(lines, None)  # the line of its points, which may be empty
+        points = next(lines, "").split()
+        if len(points) % 3 or (points and not points[-1].removeprefix("-").isdecimal()):
+            found = f"the line after image {fields[0]} is no line of points"
+            expected = "X, Y, POINT3D_ID for each point, or an empty line if the image has none"
+            raise DataError(f"{path}: {found}; expected {expected}")
+        images.append((int(fields[0]), fields[1:8], fields[9] if len(fields) == 10 else ""))
+    return images
+
+
+def _check_colmap_frame_poses(
+    model: Any, stored: Sequence[tuple[int, Sequence[Any], str]], folder: Path, kind: str
+) -> None:
+    """Raise DataError if the pose of an image differs in the frames file, from which COLMAP 3.12 and later read it."""
+    pycolmap = import_pycolmap()
+    for number, pose, _ in stored:
+        image = model.images[number]
+        if not image.has_pose:
+            continue
+        w, x, y, z, *shift = map(float, pose)
+        turn = pycolmap.Rotation3d(np.array([x, y, z, w]))
+        found, read = pycolmap.Rigid3d(turn, np.array(shift)).matrix(), colmap_viewmat(image)[:3].numpy()
+        unit = [1.0, 1.0, 1.0, max(float(np.linalg.norm(shift)), 1e-2)]
+        if not np.allclose(found / unit, read / unit, rtol=0.0, atol=1e-4, equal_nan=True):
+            what = f"the pose of image {image.name} in images{kind} differs from that in frames{kind}"
+            remedy = "remove rigs.* and frames.* if another program changed images.*"
+            raise DataError(f"{folder}: {what}; expected equal poses ({remedy})")
 
 
 def _lens_parameter_count(model: int) -> int:
@@ -163,6 +200,8 @@ def read_colmap_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[st
     found, bent = [], Counter[str]()
     for image in images:
         lens = reconstruction.cameras[image.camera_id]
+        if not PurePosixPath(image.name).name:
+            raise DataError(f"{folder}: image {image.image_id} has the name {image.name!r}; expected a file name")
         where = f"{folder}: camera {image.camera_id} of image {image.name}"
         if lens.model_name not in (*PINHOLES, *_DISTORTED):
             expected = ", ".join((*PINHOLES, *_DISTORTED))

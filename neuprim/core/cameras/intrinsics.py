@@ -321,7 +321,10 @@ def has_fisheye_lens(frame: JsonReader, file: JsonReader, others: tuple[str, ...
     """
     record = _record_with_camera_keys(("camera_model", "is_fisheye"), frame, file)
     model = record.text("camera_model") if record.has("camera_model") else "OPENCV"
-    if model == "OPENCV_FISHEYE" or record.values.get("is_fisheye") is True:
+    fisheye = record.values.get("is_fisheye")
+    if fisheye not in (None, False, True):  # 0 and 1 equal False and True
+        raise record.fail("is_fisheye", "true or false")
+    if model == "OPENCV_FISHEYE" or fisheye:
         return True
     if model not in MODELS:
         raise record.fail("camera_model", "one of " + ", ".join((*MODELS, *others)))
@@ -336,7 +339,7 @@ _HARMLESS = frozenset(
     # extents, starting values and switches of the training of other programs
     "aabb_scale aabb aabb_range render_aabb scale offset up sphere_center sphere_radius scene_scale scene_box "
     "near far bounds camera_near camera_far n_frames sharpen sharpness sharpness_discard_threshold "
-    "importance_sampling n_extra_learnable_dims envmap from_na orientation_override auto_scale_poses_override "
+    "importance_sampling n_extra_learnable_dims envmap orientation_override auto_scale_poses_override "
     "fps seconds "
     # poses and points are already in the frame that these lead to
     "applied_transform applied_scale "
@@ -370,6 +373,8 @@ _REFUSED = {
     **dict.fromkeys("white_transparent black_transparent fix_premult alpha_path fg_mask_path".split(), _ALPHA),
     **dict.fromkeys(("shift_x", "shift_y"), "a shifted lens; expected cx, cy with the shift in them, and no shift"),
     "normal_mts_args": "Mitsuba's axes; expected OpenGL's, x right, y up, z backward",
+    "from_na": "NeuS2's camera axes (OpenCV: y down, z forward); expected OpenGL's, x right, y up, z backward, and no "
+    "from_na",
     "driver_parameters": "a light of its own in every frame; expected task=relight scene=olat, with pl_pos",
 }
 """Map from each unsupported key that changes the image to what the key describes, for the error message."""

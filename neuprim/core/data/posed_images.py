@@ -171,6 +171,8 @@ def unique_view_names(paths: Iterable[str], where: str) -> list[str]:
     of the image is put in front. Raises DataError if a path occurs twice.
     """
     texts = [p.replace("\\", "/").removeprefix("./") for p in paths]
+    # bytes that are not UTF-8 are lone surrogates in a path, which cannot be written in other files
+    texts = [t.encode("utf-8", "backslashreplace").decode() for t in texts]
     path, count = max(Counter(texts).items(), key=lambda item: item[1], default=("", 0))
     if count > 1:
         raise DataError(f"{where}: image {path!r} is listed {count} times; expected once")
@@ -281,6 +283,11 @@ def _check_dataset_splits(
         if frame.info.channels != first.info.channels:
             found = f"image has {frame.info.channels} channels, but {first.path} has {first.info.channels}"
             raise DataError(f"{frame.path}: {found}; expected only RGB images, or only RGBA images")
+    trained = {frame.path.resolve() for frame in train}
+    shared = [frame.path.name for frame in test if frame.path.resolve() in trained]
+    if shared:
+        found = f"{len(shared)} of {len(test)} test images are training images, too, e.g. {shared[0]}"
+        warn_once(f"{where}: {found}; their quality says nothing about new views")
 
 
 def _choose_dataset_background(where: str, background: str, alpha: bool) -> str:

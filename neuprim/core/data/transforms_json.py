@@ -162,6 +162,9 @@ def _read_distortion(record: JsonReader, document: JsonReader, fisheye: bool) ->
     """Return the lens distortion of a frame; None for a pinhole, which has only zero coefficients."""
     lens = read_lens_coefficients(record, document)
     k, p = [lens[f"k{i}"] for i in (1, 2, 3, 4)], [lens["p1"], lens["p2"]]
+    if fisheye and any(p):
+        found = f"p1, p2 are {p[0]:g}, {p[1]:g} for a fisheye lens, which has only k1 to k4"
+        raise DataError(f"{record.where}: {found}; expected 0, or undistorted images")
     if fisheye:
         return FisheyeDistortion(*k)
     return RadialDistortion(*k, *p) if any(k) or any(p) else None

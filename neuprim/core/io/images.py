@@ -96,12 +96,17 @@ def read_image(path: Path, size: tuple[int, int] | None = None, channels: Sequen
 def read_mask_image(path: Path, size: tuple[int, int] | None = None) -> Tensor:
     """Read a PNG, JPEG or WebP as (H, W) bool mask: True where a colour channel is not 0.
 
-    Raises the errors of :func:`read_image`.
+    Raises the errors of :func:`read_image`, and DataError if pixels with a colour are transparent.
     """
     with refuse_image_file_beyond_memory(path), _open_image(path) as image:
-        _lossless_mode(path, image)
+        mode = _lossless_mode(path, image)
         _check_image_size(path, image.width, image.height, size)
-        return torch.from_numpy(_decode_image(path, image, "RGB").any(axis=-1))
+        pixels = _decode_image(path, image, mode)
+        colored = pixels[..., :3].any(axis=-1)
+        if mode == "RGBA" and (colored & (pixels[..., 3] == 0)).any():  # some programs mask by alpha
+            what = "transparent pixels of the mask are not black"
+            raise DataError(f"{path}: {what}; expected black and white without alpha")
+        return torch.from_numpy(colored)
 
 
 def _check_image_size(path: Path, width: int, height: int, size: tuple[int, int] | None) -> None:

@@ -67,3 +67,52 @@ def test_a_count_that_the_file_does_not_pay_for(tmp_path: Path) -> None:
     path.write_bytes(struct.pack("<Q", 2**60) + path.read_bytes()[8:])
     with pytest.raises(DataError, match=r"images.bin: truncated or corrupt"):
         read_camera_file(tmp_path / "binary")
+
+
+@pytest.mark.parametrize("name", ["a.png", "left cam/IMG  1.png", "0001"])
+def test_images_without_their_lines_of_points(tmp_path: Path, name: str) -> None:
+    lines = [line.replace("a.png", name) for line in IMAGES.split("\n") if "png" in line]
+    folder = model(tmp_path / "m", images="\n".join(lines[::-1]))
+    with pytest.raises(DataError, match=r"images.txt: the line after image 1 is no line of points; expected X, Y, "):
+        read_camera_file(folder)
+
+
+@pytest.mark.parametrize("name", ["", "/"])
+def test_images_without_names(tmp_path: Path, name: str) -> None:
+    read = pycolmap.Reconstruction(str(model(tmp_path / "text")))
+    read.images[1].name = name
+    (tmp_path / "binary").mkdir()
+    read.write_binary(str(tmp_path / "binary"))
+    with pytest.raises(DataError, match=f"binary: image 1 has the name '{name}'; expected a file name"):
+        read_camera_file(tmp_path / "binary")
+
+
+@pytest.mark.skipif(not hasattr(pycolmap, "Rig"), reason="this pycolmap has no rigs")
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+def test_poses_of_images_and_frames_must_agree(tmp_path: Path, kind: str) -> None:
+    read = pycolmap.Reconstruction()
+    rig, frame = pycolmap.Rig(rig_id=1), pycolmap.Frame(frame_id=1, rig_id=1)
+    turned = pycolmap.Rotation3d([0.5, 0.5, 0.5, 0.5])
+    images = [pycolmap.Image(name=f"{i}.png", camera_id=i, image_id=i) for i in (1, 2)]
+    for i, image in enumerate(images, 1):
+        lens = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[60, 60, 32, 24], camera_id=i)
+        read.add_camera(lens)
+        rig.add_ref_sensor(lens.sensor_id) if i == 1 else rig.add_sensor(
+            lens.sensor_id, pycolmap.Rigid3d(turned, [0.1, 0.2, 0.3])
+        )
+        frame.add_data_id(image.data_id)
+        image.frame_id = 1
+    read.add_rig(rig)
+    frame.rig_from_world = pycolmap.Rigid3d(turned, [1.0, 2.0, 3.0])
+    read.add_frame(frame)
+    for image in images:
+        read.add_image(image)
+    write = read.write_binary if kind == "bin" else read.write_text
+    write(str(tmp_path))
+    assert len(read_camera_file(tmp_path).named) == 2
+    frames = (tmp_path / f"frames.{kind}").read_bytes()
+    read.transform(pycolmap.Sim3d(10.0, pycolmap.Rotation3d(), [0.0, 0.0, 0.0]))
+    write(str(tmp_path))
+    (tmp_path / f"frames.{kind}").write_bytes(frames)
+    with pytest.raises(DataError, match=rf"pose of image 1.png in images.{kind} differs from that in frames.{kind}"):
+        read_camera_file(tmp_path)

@@ -121,7 +121,7 @@ def test_a_lens_comes_whole_from_the_frame() -> None:
 REFUSED: dict[str, Any] = {"latlong": True, "equirectangular": 1, "ftheta_p1": 0.3, "ortho": True, "k5": 0.01}
 REFUSED |= {"rolling_shutter": [0, 0.1, 0, 0], "transform_matrix_start": POSE, "shift_x": 0.2, "lens_model": "fov"}
 REFUSED |= {"distortion_params": [0.1, 0, 0, 0], "camera_type": "EQUIRECTANGULAR", "white_transparent": True}
-REFUSED |= {"driver_parameters": {"LightX": 1}}
+REFUSED |= {"driver_parameters": {"LightX": 1}, "from_na": True}
 
 
 @pytest.mark.parametrize("key", REFUSED)
@@ -132,9 +132,10 @@ def test_keys_that_change_the_picture_are_refused_by_name(key: str) -> None:
 
 def test_unknown_keys_are_named_once_and_those_of_real_files_are_not() -> None:
     known = {"aabb_scale": 16, "applied_transform": POSE, "frames": [], "orientation_override": "none"}
-    file = JsonReader({**known, "is_fisheye": False, "exposures": 1}, "t.json")
+    file = JsonReader({**known, "is_fisheye": False, "from_na": False, "exposures": 1}, "t.json")
     frame = {"file_path": "a", "colmap_im_id": 1, "sharpness": 3.0, "time": 0.1, "depth_file_path": "d"}
     frames = [JsonReader(frame, "f")] * 3
+    refuse_unsupported_camera_keys(file)
     line = describe_unknown_camera_keys(file, frames, ())
     assert line.startswith("t.json: keys that are not read: exposures, frames[].time; task=dynamic")
     assert describe_unknown_camera_keys(file, frames, ("time", "exposures")) == ""

@@ -220,12 +220,16 @@ def test_masks_are_colours_that_are_not_zero(tmp_path: Path) -> None:
     for image, expected in (
         (grey, [[False, True], [True, True]]),
         (grey.convert("RGB"), [[False, True], [True, True]]),
-        (Image.fromarray(np.array([[[0, 0, 0, 255]]], np.uint8)), [[False]]),  # opaque black
+        (Image.fromarray(np.array([[[0, 0, 0, 255], [9, 0, 0, 200], [0, 0, 0, 0]]], np.uint8)), [[False, True, False]]),
         (palette, [[False, True, False]]),
         (Image.fromarray(np.array([[True, False]])), [[True, False]]),
     ):
         image.save(tmp_path / "m.png")
         assert images.read_mask_image(tmp_path / "m.png").tolist() == expected
+    for mode in ("RGBA", "LA"):
+        Image.new("RGBA", (2, 2), (255, 255, 255, 0)).convert(mode).save(tmp_path / "m.png")
+        with pytest.raises(DataError, match=r"m.png: transparent pixels of the mask are not black; expected black"):
+            images.read_mask_image(tmp_path / "m.png")
     (tmp_path / "m.png").write_bytes(png(2, 2, 16, 0, (b"\0" + bytes(4)) * 2))
     with pytest.raises(DataError, match="16-bit"):
         images.read_mask_image(tmp_path / "m.png")

@@ -147,6 +147,37 @@ def test_a_grid_with_another_background_stays_dense(monkeypatch: pytest.MonkeyPa
     assert build_medium({"density": grid}, LOOK, np.eye(4)).bricks.dense
 
 
+@pytest.mark.parametrize("edge", [1.0, 1.7])
+@pytest.mark.parametrize("dense", [True, False])
+def test_colours_are_the_background_where_none_are_stored(
+    edge: float, dense: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """White is the background; on the same voxels and on others, in bricks and in one block."""
+    if not dense:
+        monkeypatch.setattr(lit_medium, "_DENSE_VOXELS", 0)
+    density = VdbGrid.from_dense("density", scattered_blobs(0, SHAPE))
+    black = np.zeros((8, 8, 8, 3), np.float32)
+    place = vdb_scale_transform(edge, (0.0, 0.0, 0.0))
+    color = VdbGrid.from_dense("color", black, transform=place, background=1.0)
+    optics = Optics(color_grid="color", ambient=(1.0, 1.0, 1.0))
+    for grid in (color, VdbGrid.from_dense("color", np.ones_like(black), transform=place, background=1.0)):
+        medium = build_medium({"density": density, "color": grid}, optics, np.eye(4))
+        assert medium.bricks.dense == dense
+        values = medium.values.reshape(-1, 4)
+        ratio = values[:, 1][values[:, 0] > 0] / values[:, 0][values[:, 0] > 0]
+        assert (ratio > 0.999).mean() > 0.6 and (grid is not color or ratio.min() < 0.01)
+
+
+def test_samples_are_the_background_where_none_is_stored() -> None:
+    values = np.full((8, 8, 8), 300.0, np.float32)
+    values[0, 0, 0] = 1500.0
+    grid = VdbGrid.from_dense("temperature", values, background=300.0)
+    points = np.array([[0.0, 0, 0], [4, 4, 4], [20, 0, 0], [-50, 9, 9]])
+    np.testing.assert_array_equal(lit_medium.vdb_grid_sampler(grid)(points)[:, 0], [1500, 300, 300, 300])
+    nowhere = VdbGrid.from_dense("temperature", np.full((8, 8, 8), 300.0, np.float32), background=300.0)
+    np.testing.assert_array_equal(lit_medium.vdb_grid_sampler(nowhere)(points), np.full((4, 1), 300.0))
+
+
 def test_refusals(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Two far voxels: a box of 10^15 voxels; and more bricks than fit."""
     grid = VdbGrid.from_dense("density", np.ones((1, 1, 1)))

@@ -16,7 +16,7 @@ import torch
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import hold_out_views
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.io.vdb import VdbGrid, vdb_scale_transform, write_vdb
+from neuprim.core.io.vdb import VdbGrid, VdbTiles, list_vdb_files, vdb_scale_transform, write_vdb
 from neuprim.core.volumes.density_grid import box_lattice
 from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.volume import capture as capturing
@@ -26,7 +26,7 @@ from neuprim.tasks.dynamic.volume.capture_density import CaptureDensity, sample_
 from neuprim.tasks.dynamic.volume.capture_voxels import FrameVoxels, MediumVoxels
 from neuprim.tasks.dynamic.volume.lit_medium import build_medium
 from neuprim.tasks.dynamic.volume.optics import optics_preset, override_optics
-from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation
+from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation, find_volume_grids, survey_volume_frames
 from neuprim.tasks.dynamic.volume.volume_scene import choose_volume_frames
 from tests.tasks.dynamic.sequences import (
     MIDDLE,
@@ -267,6 +267,56 @@ def test_a_grid_by_another_name_and_one_of_vectors(hot: Path, tmp_path: Path) ->
     write_vdb(only / "wind_1.vdb", [replace(vector, name="vel")])
     with pytest.raises(DataError, match=r"wind_1\.vdb: grid 'vel' has 3 channels; expected 1"):
         dataset(only, tmp_path, grids={"density": "vel"})
+    write_vdb(only / "wind_1.vdb", [*blob(11.0, ("density",)), replace(vector, name="flames")])
+    with pytest.raises(DataError, match=r"wind_1\.vdb: grid 'flames' has 3 channels; expected 1"):
+        dataset(only, tmp_path, look="smoke_fire")
+    dataset(only, tmp_path, look="colorful_smoke")  # does not use flames
+
+
+def test_frames_with_different_usual_names_are_refused(hot: Path, tmp_path: Path) -> None:
+    write_vdb(hot / "ball_2.vdb", blob(12.0, ("smoke", "temperature", "flames")))
+    with pytest.raises(
+        DataError, match=r"ball_2\.vdb: no grid 'density', .* but 'smoke'; .*: scene\.grids\.density=NAME"
+    ):
+        dataset(hot, tmp_path)
+    assert dataset(hot, tmp_path, grids={"density": "smoke"}).exposure > 0
+
+
+def test_a_tile_counts_as_all_its_voxels(tmp_path: Path) -> None:
+    """A core of 10 in tiles, 14 % of all voxels, in a haze of 0.05: the peak is 10."""
+    corners = np.stack(np.meshgrid(*(np.arange(0, 32, 8),) * 3), -1).reshape(-1, 3).astype(np.int32)
+    tiles = VdbTiles(corners, np.full(64, 8, np.int32), np.full(64, 10, np.float32), np.ones(64, bool))
+    haze = np.array([[32 + 8 * (i % 20), 8 * (i // 20), 0] for i in range(400)], np.int32)
+    values = np.full((400, 8, 8, 8), 0.05, np.float32)
+    zero = np.zeros((), np.float32)
+    write_vdb(tmp_path / "a_1.vdb", [VdbGrid("density", np.eye(4), zero, haze, values, values > 0, tiles)])
+    frames = list(list_vdb_files(tmp_path).frames)
+    survey = survey_volume_frames(frames, find_volume_grids(frames, {}), optics_preset("smoke_fire"), lambda *_: None)
+    assert survey.peaks["density"] == pytest.approx(10, rel=0.01)
+
+
+def test_fire_by_temperature_is_adapted_to_the_files_by_either_setting(tmp_path: Path) -> None:
+    (tmp_path / "files").mkdir()
+    for number in (1, 2):
+        smoke, heat = blob(10.0 + number, ("density", "temperature"))
+        write_vdb(tmp_path / "files" / f"fire_{number}.vdb", [smoke, replace(heat, values=1000 * heat.values)])
+    settings: list[dict[str, Any]] = [{"grids": {"flames": "temperature"}}, {"optics": {"flame_grid": "temperature"}}]
+    first, second = (
+        recorded(dataset(tmp_path / "files", tmp_path / str(i), look="smoke_fire", **more)).capture.optics
+        for i, more in enumerate(settings)
+    )
+    assert second.flame_range == first.flame_range and second.flame_range[1] > 0
+    assert second.flame_extinction == first.flame_extinction != optics_preset("smoke_fire").flame_extinction
+
+
+def test_precision_is_that_of_the_first_file_with_the_grid(folder: Path, tmp_path: Path, data: Dataset) -> None:
+    for number in NUMBERS[1:]:
+        write_vdb(
+            folder / f"ball_{number}.vdb", [replace(grid, half=True) for grid in blob(8.0 + number, ("density",))]
+        )
+    write_vdb(folder / "ball_2.vdb", [replace(grid, name="other") for grid in empty_frame()])
+    found = CaptureDensity(recorded(dataset(folder, tmp_path)).capture)
+    assert found.half and not CaptureDensity(recorded(data).capture).half
 
 
 def sphere_level_set(radius: float, width: float = 1.5) -> VdbGrid:

@@ -89,6 +89,7 @@ def names(views: Any) -> list[str]:
         ),
         (fisheye(0.05, -0.01), {"k1": 0.05, "k2": -0.01, "camera_model": "OPENCV_FISHEYE"}),
         (fisheye(0.0, 0.0), {"is_fisheye": True}),
+        (fisheye(0.0, 0.0), {"is_fisheye": 1}),
     ],
 )
 def test_lenses_are_undone(capture: Any, scenes: Any, context: Any, lens: Lens, fields: dict[str, Any]) -> None:
@@ -296,6 +297,8 @@ def frame(**fields: Any) -> Callable[[Any], None]:
         (lambda d: d.update(w=64.5), "w is 64.5; expected a positive whole number"),
         (lambda d: d.update(w=32), "image is 64x50; expected 32x50"),
         (lambda d: d.update(camera_model="EQUIRECTANGULAR"), "OPENCV_FISHEYE"),
+        (lambda d: d.update(camera_model="OPENCV_FISHEYE", p1=0.1), "p1, p2 are 0.1, 0 for a fisheye lens"),
+        (frame(is_fisheye="yes"), 'frames[3]: is_fisheye is "yes"; expected true or false'),
         (frame(transform_matrix=np.diag([1.0, -1.0, 1.0, 1.0]).tolist()), "mirrored"),
         (frame(transform_matrix=np.zeros((4, 4)).tolist()), "0 0 0 1"),
         (frame(file_path=7), "frames[3]: file_path is 7"),
@@ -328,3 +331,20 @@ def test_missing_images_are_listed_or_skipped(capture: Any, scenes: Any, context
     for file in (path / "images").iterdir():
         file.unlink()
     scenes.refused(load, {"path": path, "skip_missing": True}, context, "10 files not found")
+
+
+def test_names_that_are_not_utf8_become_names_that_can_be_written(capture: Any, context: Any) -> None:
+    path = capture()
+    try:
+        (path / "images" / "03.png").rename(path / "images" / "caf\udce9.png")
+    except OSError:
+        pytest.skip("this file system has only names in UTF-8")
+    edit(path, lambda d: d["frames"][6].update(file_path="images\\caf\udce9.png"))
+    assert "caf\\udce9" in names(load({"path": path}, context).train)
+
+
+def test_test_images_that_are_training_images_are_told(capture: Any, context: Any) -> None:
+    path = capture()
+    edit(path, lambda d: d["frames"].append({**d["frames"][9], "file_path": "images/00"}))
+    with pytest.warns(NeuprimWarning, match=r"1 of 2 test images are training images, too, e.g. 00.png"):
+        load({"path": path}, context)

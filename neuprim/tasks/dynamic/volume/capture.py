@@ -140,7 +140,8 @@ class Capture:
     def read_channels(self, frame: VdbFrame, points: np.ndarray) -> dict[str, np.ndarray]:
         """Return name -> (M, C) float32 values of each channel at ``points`` (M, 3), scene units.
 
-        Values are trilinear between voxels, and 0 where the file has none. Raises DataError if the file is damaged.
+        Values are trilinear between voxels, and the grid's background where it stores none; 0 if the file has no such
+        grid. Raises DataError if the file is damaged.
         """
         found = {name: np.zeros((len(points), own.width), np.float32) for name, own in self.channels.items()}
         return found | sample_vdb_frame(frame, self.channels, self._world_points(points))

@@ -72,8 +72,8 @@ class CaptureDensity(DensityGridSource):
             numbers = re.findall(r"[0-9]{1,18}", path.stem)  # the last one counts, as in a folder
             files = [VdbFrame(int(numbers[-1]) if numbers else -1, path)]
         self._files = files
-        headers = (grid for file in files[:1] for grid in read_header(file.path).grids)
-        self.half = any(grid.name == self.placement.grid and grid.half for grid in headers)
+        grids = (grid for file in files for grid in read_header(file.path).grids if grid.name == self.placement.grid)
+        self.half = next((grid.half for grid in grids), False)  # not of the first file: empty grids are left out
         self._cached: tuple[int, Medium] | None = None
         timed = [{"time": torch.tensor(capture.time(f))} if first <= f.number <= last else {} for f in files]
         self.frames = [TruthFrame(file.path.name, times) for file, times in zip(files, timed, strict=True)]

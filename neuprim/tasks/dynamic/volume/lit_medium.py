@@ -46,7 +46,7 @@ def build_medium(grids: Mapping[str, VdbGrid], optics: Optics, scene_from_world:
         DataError: no extinction grid exists, a grid has a wrong number of channels, the box is too large, or an
             extinction overflows.
     """
-    flames = grids.get(optics.flame_grid) if optics.emission > 0.0 or optics.flame_extinction > 0.0 else None
+    flames = grids.get(optics.flame_grid) if optics.uses_flames else None
     base = next((grids[name] for name in optics.extinction_grids if name in grids), None)
     if base is None and flames is not None and optics.flame_extinction > 0.0:  # flames absorb by themselves
         base = VdbGrid.from_dense(
@@ -195,28 +195,33 @@ class _MediumGrid:
         shape = self.bricks.shape
         if _same_voxels(grid.transform, self.transform):
             return grid.to_dense(self.box, limit, 0.0)
+        _, level = _subtract_background(grid)
         if grid.bounds is None:
-            return np.zeros((*shape, 3)[: 2 + min(grid.channels, 2)], np.float32)
+            return np.full((*shape, 3)[: 2 + min(grid.channels, 2)], level, np.float32)
         around = _make_medium_bounds(np.array(grid.bounds[0]) - 1, np.array(grid.bounds[1]) + 1)
         own = grid.to_dense(around, limit, 0.0)
         matrix = np.linalg.inv(grid.transform) @ self.transform
         offset = matrix[:3, :3] @ np.array(self.box[0], np.float64) + matrix[:3, 3] - np.array(around[0])
         planes = [own] if grid.channels == 1 else list(np.moveaxis(own, -1, 0))
-        settings = (matrix[:3, :3], offset, shape)
-        sampled = [ndimage.affine_transform(p, *settings, order=1, mode="grid-constant") for p in planes]
+        sampled = [
+            ndimage.affine_transform(plane, matrix[:3, :3], offset, shape, order=1, mode="grid-constant", cval=outside)
+            for plane, outside in zip(planes, np.atleast_1d(level), strict=True)
+        ]
         return sampled[0] if grid.channels == 1 else np.stack(sampled, -1)
 
     def _sample_bricks(self, grid: VdbGrid) -> np.ndarray:
-        own = self
+        own, (grid, level) = self, _subtract_background(grid)
+        found = np.zeros((len(self.bricks.origins), *self.bricks.block, *grid.values.shape[4:]), np.float32)
         if not _same_voxels(grid.transform, self.transform):
             if grid.bounds is None:
-                return np.zeros((len(self.bricks.origins), *self.bricks.block, *grid.values.shape[4:]), np.float32)
+                found += level
+                return found
             own = _MediumGrid.in_bricks([grid], grid.transform, grid.bounds)
         values = read_bricks(grid, own.first, own.bricks)
         values[~np.isfinite(values)] = 0.0
         if own is self:
+            values += level
             return values
-        found = np.zeros((len(self.bricks.origins), *self.bricks.block, *grid.values.shape[4:]), np.float32)
         matrix = np.linalg.inv(grid.transform) @ self.transform
         inside = np.indices(self.bricks.block).reshape(3, -1).T @ matrix[:3, :3].T
         origins = (self.bricks.origins + self.first) @ matrix[:3, :3].T + matrix[:3, 3] - own.first
@@ -224,17 +229,29 @@ class _MediumGrid:
             for c in np.ndindex(values.shape[4:]):
                 sampled = own.bricks.sample(values[(..., *c)], inside + origin)
                 found[(brick, ..., *c)] = sampled.reshape(self.bricks.block)
+        found += level
         return found
+
+
+def _subtract_background(grid: VdbGrid) -> tuple[VdbGrid, np.ndarray]:
+    """Return a grid minus its background, so that it is 0 where nothing is stored, and the background, () or (3,)."""
+    level = np.where(np.isfinite(grid.background), grid.background, np.float32(0.0))
+    if not level.any():
+        return grid, level
+    tiles = replace(grid.tiles, values=grid.tiles.values - level)
+    return replace(grid, values=grid.values - level, tiles=tiles, background=np.zeros_like(level)), level
 
 
 def vdb_grid_sampler(grid: VdbGrid) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function (points (M, 3), world coordinates) -> (M, C) float32 values of a grid.
 
-    Values are trilinear between voxels, and 0 outside the grid's voxels and where they are not finite. In a staggered
-    grid, component a of a voxel is the value half a voxel before the voxel's centre along axis a.
+    Values are trilinear between voxels. They are the background where no voxel is stored or a value is not finite. In a
+    staggered grid, component a of a voxel is the value half a voxel before the voxel's centre along axis a.
     """
+    grid, level = _subtract_background(grid)
+    level = np.broadcast_to(level, grid.channels)
     if grid.bounds is None:
-        return lambda points: np.zeros((len(points), grid.channels), np.float32)
+        return lambda points: np.tile(level, (len(points), 1))
     try:
         own = _MediumGrid.in_bricks([grid], grid.transform, grid.bounds)
     except DataError as error:
@@ -248,7 +265,7 @@ def vdb_grid_sampler(grid: VdbGrid) -> Callable[[np.ndarray], np.ndarray]:
 
     def sample(points: np.ndarray) -> np.ndarray:
         index = points @ back[:3, :3].T + back[:3, 3] - own.first
-        return np.stack([own.bricks.sample(parts[c], index + shifts[c]) for c in channels], -1)
+        return np.stack([own.bricks.sample(parts[c], index + shifts[c]) for c in channels], -1) + level
 
     return sample
 

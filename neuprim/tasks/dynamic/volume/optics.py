@@ -138,6 +138,11 @@ class Optics:
         """
         return min(sum(self.albedo) / 6, 1.0)
 
+    @property
+    def uses_flames(self) -> bool:
+        """Whether flames glow or absorb."""
+        return self.emission > 0.0 or self.flame_extinction > 0.0
+
     def mixes(self, names: Container[str]) -> bool:
         """Return whether both the extinction grid and the flames absorb, in files with the grids ``names``."""
         return self.extinction > 0 and self.flame_extinction > 0 and self.flame_grid in names

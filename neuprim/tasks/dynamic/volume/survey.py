@@ -98,12 +98,16 @@ def find_volume_grids(frames: Sequence[VdbFrame], chosen: Mapping[str, str]) -> 
     """Find the grids by meaning in all frames, first by the names that the user chose, then by common names.
 
     Raises:
-        DataError: a chosen grid is in no file or cannot be read (such as points), or no grid absorbs.
+        DataError: a chosen grid is in no file or cannot be read (such as points), frames use different usual names of
+            one meaning, or no grid absorbs.
     """
     refusals: dict[str, str | None] = {}  # name -> why the grid cannot be used
     level_sets: set[str] = set()
+    stored: dict[Path, set[str]] = {}  # names of the grids of each file
     for frame in frames:
-        for grid in read_header(frame.path).grids:
+        grids = read_header(frame.path).grids
+        stored[frame.path] = {grid.name for grid in grids}
+        for grid in grids:
             refusal = grid.refusal()
             if grid.name not in refusals or refusal is None:
                 refusals[grid.name] = refusal
@@ -125,6 +129,10 @@ def find_volume_grids(frames: Sequence[VdbFrame], chosen: Mapping[str, str]) -> 
             names[meaning] = name
         elif usable := [name for name in usual if name in refusals and refusals[name] is None]:
             names[meaning] = usable[0]
+            for path, there in stored.items() if meaning in ("density", "flames") else ():
+                if usable[0] not in there and (others := there.intersection(usable)):
+                    what = f"no grid {usable[0]!r}, which other frames have, but {sorted(others)[0]!r}"
+                    raise DataError(f"{path}: {what}; expected equal names. Choose one: scene.grids.{meaning}=NAME")
     if not {"density", "temperature"} & names.keys():
         listed = ", ".join(f"{name} ({why or 'readable'})" for name, why in sorted(refusals.items())) or "none"
         raise DataError(
@@ -200,12 +208,13 @@ def survey_volume_frames(
         DataError: no frame has an active voxel.
     """
     matter, extents, hottest, voxel = list[GridExtent](), dict[int, GridExtent](), 0.0, math.inf
-    histograms = {meaning: np.zeros(1 << 15, np.int64) for meaning in (reader.extinction, "flames")}
+    histograms = {meaning: np.zeros(1 << 15) for meaning in (reader.extinction, optics.flame_grid)}
+    needed = {reader.extinction, *([optics.flame_grid] if optics.uses_flames else [])}
     for i, frame in enumerate(frames):
         progress("looking through the frames", i / len(frames))
         extents[frame.number] = GridExtent(0.0, 0.0, None)
         for meaning, grid in reader.read(frame.path).items():
-            if meaning == reader.extinction and grid.channels != 1:
+            if grid.channels != 1 and meaning in needed:
                 what = f"grid {reader.names[meaning]!r} has {grid.channels} channels"
                 raise DataError(f"{frame.path}: {what}; expected 1")
             box = grid.world_bounds()
@@ -214,10 +223,10 @@ def survey_volume_frames(
             low, high = (max(value, 0.0) for value in grid.range or (0.0, 0.0))
             extent = GridExtent(low, high, box)
             voxel = min(voxel, float(np.linalg.norm(grid.transform[:3, :3], axis=0).min()))
-            histograms[meaning] += _count_vdb_values(grid.active_values())
+            histograms[meaning] += _count_vdb_values(grid)
             if meaning == reader.extinction:
                 extents[frame.number] = extent
-            if meaning == "flames":
+            if meaning == optics.flame_grid:
                 hottest = max(hottest, extent.largest)
             if meaning == reader.extinction or optics.mixes(reader.names):
                 matter.append(extent)
@@ -230,10 +239,13 @@ def survey_volume_frames(
     return SequenceSurvey(box, extents, hottest, peaks, voxel)
 
 
-def _count_vdb_values(values: np.ndarray) -> np.ndarray:
-    """Return a histogram (2^15,) of the positive values. The bin of a value is the upper 16 bits of its float32."""
-    positive = values[np.isfinite(values) & (values > 0)]
-    return np.bincount(positive.astype(np.float32).view(np.uint32) >> 16, minlength=1 << 15)
+def _count_vdb_values(grid: VdbGrid) -> np.ndarray:
+    """Return a histogram (2^15,) of the positive active voxels. A value's bin is the upper 16 bits of its float32."""
+    values, tiles = grid.active_values(), grid.tiles
+    voxels = np.ones(len(values))
+    voxels[len(values) - np.count_nonzero(tiles.active) :] = tiles.sizes[tiles.active].astype(np.float64) ** 3
+    positive = np.isfinite(values) & (values > 0)
+    return np.bincount(values[positive].astype(np.float32).view(np.uint32) >> 16, voxels[positive], 1 << 15)
 
 
 def _peak_vdb_value(counts: np.ndarray) -> float:
@@ -249,7 +261,7 @@ def data_dependent_optics(optics: Optics, extinction: str, survey: SequenceSurve
     Presets assume grids with a peak of about 1. The extinctions are therefore divided by the peak of the files' grids.
     The divisor is rounded to a power of two, so that the divisor rarely changes when frames are added or left out.
     """
-    grids = {"extinction": extinction, "flame_extinction": "flames"}
+    grids = {"extinction": extinction, "flame_extinction": optics.flame_grid}
     settings: dict[str, Any] = {
         key: getattr(optics, key) * 2.0 ** -round(math.log2(survey.peaks[meaning]))
         for key, meaning in grids.items()

@@ -275,7 +275,8 @@ def _prepare_vdb_scene(
     if known is None:
         survey = survey_volume_frames(frames, reader, optics, context.progress)
         if not survey.hottest > 0:  # no flames in any frame: leave out everything that only flames need
-            reader = replace(reader, names={m: n for m, n in reader.names.items() if m != "flames"})
+            needless = {optics.flame_grid} - {reader.extinction}
+            reader = replace(reader, names={m: n for m, n in reader.names.items() if m not in needless})
         if options.vdb is not None:
             derived = data_dependent_optics(optics, reader.extinction, survey)
             optics = replace(optics, **{key: value for key, value in derived.items() if key not in options.optics})
@@ -310,7 +311,7 @@ def _report_chosen_extinctions(scene: _PreparedVdbScene) -> None:
     capture = scene.capture
     preset = scene.settings.resolve_optics("density" in capture.reader.names)
     lines = []
-    for key, meaning in {"extinction": capture.reader.extinction, "flame_extinction": "flames"}.items():
+    for key, meaning in {"extinction": capture.reader.extinction, "flame_extinction": preset.flame_grid}.items():
         value, usual = getattr(capture.optics, key), getattr(preset, key)
         if value != usual:
             peak = f"values of grid {capture.reader.names[meaning]!r} go up to about {usual / value:.2g}"

@@ -15,7 +15,7 @@ import torch
 
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import hold_out_views
-from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.errors import ConfigError, DataError, NeuprimWarning
 from neuprim.core.io.vdb import VdbGrid, VdbTiles, list_vdb_files, vdb_scale_transform, write_vdb
 from neuprim.core.volumes.density_grid import box_lattice
 from neuprim.tasks.dynamic import TASK
@@ -305,6 +305,8 @@ def test_fire_by_temperature_is_adapted_to_the_files_by_either_setting(tmp_path:
         recorded(dataset(tmp_path / "files", tmp_path / str(i), look="smoke_fire", **more)).capture.optics
         for i, more in enumerate(settings)
     )
+    with pytest.warns(NeuprimWarning, match="no flames, so nothing glows; scene.grids.flames=temperature makes"):
+        dataset(tmp_path / "files", tmp_path / "smoke", look="smoke_fire")
     assert second.flame_range == first.flame_range and second.flame_range[1] > 0
     assert second.flame_extinction == first.flame_extinction != optics_preset("smoke_fire").flame_extinction
 

@@ -221,7 +221,7 @@ def load_volume_scene(settings: Mapping[str, Any], context: SceneContext) -> Dat
         DataError: files are missing, damaged, or without a usable grid, or the cache cannot be written.
     """
     scene = _prepare_vdb_scene(settings, context)
-    _report_chosen_extinctions(scene)
+    _report_chosen_optics(scene)
     span = scene.span_ends()
     images = scene.rendered_frames(context).render_missing(context.progress)
     up = torch.tensor(UP_AXES[scene.settings.up], dtype=torch.float64)
@@ -306,9 +306,9 @@ def _prepare_vdb_scene(
     return _PreparedVdbScene(options, name, source, capture, range(len(train), len(train) + len(test)))
 
 
-def _report_chosen_extinctions(scene: _PreparedVdbScene) -> None:
-    """Print one line with the extinctions that differ from the preset because these were adapted to the files."""
-    capture = scene.capture
+def _report_chosen_optics(scene: _PreparedVdbScene) -> None:
+    """Print the extinctions that were adapted to the files, and whether temperature could glow instead of flames."""
+    capture, folder = scene.capture, scene.capture.frames[0].path.parent
     preset = scene.settings.resolve_optics("density" in capture.reader.names)
     lines = []
     for key, meaning in {"extinction": capture.reader.extinction, "flame_extinction": preset.flame_grid}.items():
@@ -317,7 +317,10 @@ def _report_chosen_extinctions(scene: _PreparedVdbScene) -> None:
             peak = f"values of grid {capture.reader.names[meaning]!r} go up to about {usual / value:.2g}"
             lines.append(f"scene.optics.{key}={value:g} (look: {usual:g}), because {peak}")
     if lines:
-        warn_once(f"{capture.frames[0].path.parent}: {'; '.join(lines)}. Set these settings to use other values")
+        warn_once(f"{folder}: {'; '.join(lines)}. Set these settings to use other values")
+    heat = capture.reader.names.get("temperature")
+    if preset.uses_flames and heat and preset.flame_grid not in capture.reader.names:
+        warn_once(f"{folder}: no flames, so nothing glows; scene.grids.flames={heat} makes the grid {heat!r} glow")
 
 
 # ---------------------------------------------------------------- chunks of time

@@ -11,9 +11,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import BackendUnavailable, ConfigError, nearest
-
-REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-"""Chromaticities (CIE xy) of red, green, blue and white of Rec. 709."""
+from neuprim.core.io.exr import REC709
 
 _ACES = {
     "ACEScg": (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767),

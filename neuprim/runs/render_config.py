@@ -31,7 +31,7 @@ from neuprim.core.checkpoint import read_header
 from neuprim.core.compression.file import is_compressed
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError, nearest
-from neuprim.core.io.exr import ExrChannel, write_deep_exr, write_exr_layers
+from neuprim.core.io.exr import REC709, ExrChannel, write_deep_exr, write_exr_layers
 from neuprim.core.io.images import srgb_to_linear
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import KINDS, Primitives, reduce_model, reduction_names, validate_reduction
@@ -42,7 +42,7 @@ from neuprim.core.render.output import mean_depth
 from neuprim.core.task import TaskSpec
 from neuprim.core.validation import Range, validate_settings, validate_value
 from neuprim.plugins.attribution import draw_task_layer
-from neuprim.runs.color_space import REC709, OutputColorSpace
+from neuprim.runs.color_space import OutputColorSpace
 from neuprim.runs.deep_images import draw_deep_image
 from neuprim.runs.shutter import Shutter
 from neuprim.version import __version__

@@ -48,12 +48,18 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
     found = _read_spz_vertices(path) if path.suffix.lower() == ".spz" else read_ply(path)
     if "packed_position" in found.names:
         raise _compressed_start_points_error(path, "a compressed PLY (property packed_position)")
+    if "f_anchor_feat_0" in found.names:
+        what = "anchors of Scaffold-GS (property f_anchor_feat_0), whose colours come from a network"
+        raise DataError(f"{path}: {what}; expected Gaussians or points")
     means = _starting_point_columns(found, ("x", "y", "z"))
     if means is None:
         raise DataError(f"{path}: the vertices have no properties x, y, z; expected a position for each vertex")
     if not len(means):
         raise DataError(f"{path}: no vertices; expected at least one point")
     scales, opacity = _starting_point_log_sizes(found, path), _starting_point_columns(found, ("opacity",))
+    filters = _starting_point_columns(found, ("filter_3D",))
+    if scales is not None and filters is not None:
+        scales, opacity = _filter_gaussians(scales, opacity, filters)
     quats = _starting_point_columns(found, _ROTATION) if "scale_1" in found.names else None
     colors = _starting_point_colors(found, path)
     faults = {"position": ~(np.abs(means) < 1e30).all(1), "colour": ~np.isfinite(colors).all(1)}
@@ -134,6 +140,22 @@ def _starting_point_log_sizes(found: PlyVertices, path: Path) -> np.ndarray | No
     return np.pad(scales, ((0, 0), (0, 3 - len(there))), constant_values=-np.inf)
 
 
+def _filter_gaussians(
+    scales: np.ndarray, logits: np.ndarray | None, filters: np.ndarray
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Apply the 3D filter of Mip-Splatting (Yu et al. 2024), which its files store beside unfiltered Gaussians.
+
+    ``scales`` (N, 3) are logarithms of standard deviations, ``filters`` (N, 1) the standard deviations of the filters.
+    A filtered Gaussian is wider and, in proportion, fainter.
+    """
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        wider = 0.5 * np.log(np.exp(2 * scales) + filters**2)
+        if logits is not None:
+            alphas = np.exp((scales - wider).sum(1, keepdims=True)) / (1 + np.exp(-logits))
+            logits = np.log(alphas) - np.log1p(-alphas)
+    return wider, logits
+
+
 def _starting_point_colors(found: PlyVertices, path: Path) -> np.ndarray:
     """Return the vertices' (N, 3) colours in the file's own colour space, 0..1, or above 1 for brighter light."""
     dc = _starting_point_columns(found, ("f_dc_0", "f_dc_1", "f_dc_2"))
@@ -142,11 +164,7 @@ def _starting_point_colors(found: PlyVertices, path: Path) -> np.ndarray:
     for names in _COLOURS:
         rgb = _starting_point_columns(found, names)
         if rgb is not None:
-            kind = found.rows.dtype[names[0]]
-            bytes_as_floats = kind.kind == "f" and bool(np.nanmax(rgb, initial=0.0, where=np.isfinite(rgb)) > 2.0)
-            if bytes_as_floats:
-                warn_once(f"{path}: {', '.join(names)} are floats with values above 2; read as colours from 0 to 255")
-            return rgb / (np.iinfo(kind).max if kind.kind in "iu" else 255.0 if bytes_as_floats else 1.0)
+            return rgb / found.white(names, path)
     return np.full((len(found.rows), 3), 0.5)
 
 

@@ -17,13 +17,16 @@ import OpenEXR
 import torch
 from torch import Tensor
 
-from neuprim.core.errors import DataError
+from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io.files import checked_atomic_path
 
 __all__ = ["ExrChannel", "exr_channels", "read_exr", "write_exr", "write_exr_layers"]
 
 MAX_PIXELS = 64 * 2**20
 """Largest number of pixels of an image (8192 x 8192). Larger images are refused before memory is allocated."""
+
+REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+"""Chromaticities (CIE xy) of red, green, blue and white of Rec. 709, which files have that state none."""
 
 _MAX_VALUES = 16 * MAX_PIXELS  # most values of all channels of a file, which are decoded together
 _MAX_HALF = 65504.0
@@ -112,7 +115,9 @@ def read_exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[li
     The names are ``wanted``. If ``wanted`` is None, the names are R, G, B and, if present, A: without a prefix, else
     with the prefix of the only layer that has these channels. Raises DataError for missing or subsampled channels.
     """
-    channels, width, height = _read_exr_header(path)
+    channels, width, height, primaries = _read_exr_header(path)
+    if wanted is None and not np.allclose(primaries, REC709, rtol=0, atol=2e-3):
+        warn_once(f"{path.parent}: OpenEXR files have other chromaticities than Rec. 709; colours are not converted")
     names, expected = list(wanted or ()), ", ".join(wanted or ())
     if wanted is None:
         prefixes = [n[:-1] for n in channels if n.endswith("R") and {n[:-1] + "G", n[:-1] + "B"} <= channels.keys()]
@@ -127,8 +132,11 @@ def read_exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[li
     return names, width, height
 
 
-def _read_exr_header(path: Path) -> tuple[dict[str, Any], int, int]:
-    """Return channels by name, width and height of an OpenEXR file; DataError if damaged, too large or unsupported."""
+def _read_exr_header(path: Path) -> tuple[dict[str, Any], int, int, tuple[float, ...]]:
+    """Return channels by name, width, height and chromaticities of an OpenEXR file.
+
+    Raises DataError if the header is damaged, or the file is too large or of another kind.
+    """
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
             parts = len(file.parts)
@@ -137,6 +145,7 @@ def _read_exr_header(path: Path) -> tuple[dict[str, Any], int, int]:
                 [int(v) for v in corner] for window in ("dataWindow", "displayWindow") for corner in header[window]
             )
             channels = {c.name: c for c in header["channels"]}
+            primaries = tuple(float(x) for x in header.get("chromaticities", REC709))
             flat = header.get("type", OpenEXR.scanlineimage) in (OpenEXR.scanlineimage, OpenEXR.tiledimage)
     except Exception as error:  # also KeyError and UnicodeDecodeError, from damaged attributes
         raise DataError(f"{path}: OpenEXR header is truncated or corrupt ({type(error).__name__}: {error})") from None
@@ -151,7 +160,7 @@ def _read_exr_header(path: Path) -> tuple[dict[str, Any], int, int]:
     if width * height * len(channels) > _MAX_VALUES:
         found = f"header claims {len(channels)} channels of {width}x{height} pixels"
         raise DataError(f"{path}: {found}; at most {_MAX_VALUES} values are accepted")
-    return channels, width, height
+    return channels, width, height, primaries
 
 
 def read_exr(path: Path, names: Sequence[str], width: int, height: int) -> Tensor:

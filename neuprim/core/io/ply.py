@@ -14,7 +14,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from neuprim.core.errors import DataError
+from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io.files import atomic_path
 
 _KINDS = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -42,6 +42,19 @@ class PlyVertices:
         if not names:
             return np.zeros((len(self.rows), 0))
         return np.stack([self.rows[name].astype(np.float64) for name in names], -1)
+
+    def white(self, names: Sequence[str], path: Path) -> float:
+        """Return the number that stands for 1 in the colours ``names``: 1 of floats, else the largest of the type.
+
+        It is 255 for wider types if values look like bytes, which is warned of.
+        """
+        kind, values = self.rows.dtype[names[0]], self.columns(names)
+        most = float(np.max(values, initial=0.0, where=np.isfinite(values)))
+        usual = float(np.iinfo(kind).max) if kind.kind in "iu" else 1.0
+        if 1.0 < usual <= 255.0 or most <= 2.0 or (usual > 1.0 and most > 255.0):
+            return usual
+        warn_once(f"{path}: {', '.join(names)} are {kind.name} with values up to {most:g}; read as colours of 0 to 255")
+        return 255.0
 
 
 @dataclass(frozen=True)

@@ -114,8 +114,8 @@ def read_olat_split(folder: Path, split: str, options: OlatSettings) -> list[Ima
     Raises DataError for missing or wrong fields.
     """
     document = JsonReader.open(folder / f"transforms_{split}.json")
-    near = document.number_or("camera_near", 3.0, "a distance above 0", 0.0)
-    if document.number_or("camera_far", max(10.0, 2.0 * near), f"a distance above camera_near, {near:g}") <= near:
+    near = document.number_or("camera_near", 0.0)
+    if document.number_or("camera_far", near + 1.0) <= near:
         raise document.fail("camera_far", f"a distance above camera_near, {near:g}")
     layout = TransformsLayout(
         _KEYS, _olat_frame_name, _find_olat_image, lambda record: _olat_viewmat(record, options.ignore_corrections)

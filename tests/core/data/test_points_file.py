@@ -77,7 +77,7 @@ def test_the_footprint_is_the_closest_of_those_that_hide_as_much(edge: int, volu
     assert bool((c[0] > 1.9) & (c[0] < 2.9)), "well inside what is searched"
 
 
-@pytest.mark.parametrize("form", ["bytes", "floats", "large floats", "ascii", "none"])
+@pytest.mark.parametrize("form", ["bytes", "floats", "large floats", "ints", "ushorts", "ascii", "none"])
 def test_plain_clouds(tmp_path: Path, form: str) -> None:
     path = tmp_path / "p.ply"
     if form == "ascii":
@@ -90,7 +90,9 @@ def test_plain_clouds(tmp_path: Path, form: str) -> None:
         )
     else:
         floats = [(c, "<f4") for c in ("red", "green", "blue")]
-        kind = {"bytes": [("red", "u1"), ("green", "u1"), ("blue", "u1")], "floats": floats, "large floats": floats}
+        kind = {"floats": floats, "large floats": floats}
+        for name, code in (("bytes", "u1"), ("ints", "<i4"), ("ushorts", "<u2")):
+            kind[name] = [(c, code) for c in ("red", "green", "blue")]
         rows = np.zeros(2, [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), *kind.get(form, [])])
         rows["x"], rows["y"], rows["z"] = [0, 1], [0, 2], [0, 3]
         for name, value in zip(("red", "green", "blue"), (51, 102, 255), strict=True):
@@ -107,6 +109,26 @@ def test_plain_clouds(tmp_path: Path, form: str) -> None:
     assert torch.allclose(model.params["sh_dc"] * sh.C0 + 0.5, torch.tensor(expected), atol=1e-3)
     assert model.count == 2
     assert torch.allclose(model.params["log_scales"].exp(), torch.tensor(math.sqrt(14.0)), rtol=1e-5)
+
+
+def test_the_filter_of_mip_splatting_is_applied(tmp_path: Path) -> None:
+    rows = read_ply(splats(tmp_path / "g.ply")).rows
+    filtered = numpy.lib.recfunctions.append_fields(rows, "filter_3D", np.array([0.0, 0.1, 0.1]), "<f4", usemask=False)
+    write_ply(tmp_path / "f.ply", filtered)
+    plain, found = (read_points(tmp_path / name, 3, "srgb") for name in ("g.ply", "f.ply"))
+    for cloud in (plain, found):
+        assert cloud.deviations is not None and cloud.alphas is not None
+    wide = torch.tensor([0.1, 0.2, 0.3]).square().add(0.01).sqrt()
+    torch.testing.assert_close(found.deviations, torch.stack([torch.tensor([0.1, 0.2, 0.3]), wide, wide]))  # type: ignore[arg-type]
+    share = float(torch.tensor([0.1, 0.2, 0.3]).prod() / wide.prod())
+    torch.testing.assert_close(found.alphas, plain.alphas * torch.tensor([1.0, share, share]))  # type: ignore[operator]
+
+
+def test_anchors_of_scaffold_are_no_gaussians(tmp_path: Path) -> None:
+    rows = np.zeros(2, [(name, "<f4") for name in ("x", "y", "z", "f_anchor_feat_0", "scale_0")])
+    write_ply(tmp_path / "a.ply", rows)
+    with pytest.raises(DataError, match=r"a\.ply: anchors of Scaffold-GS .*; expected Gaussians or points"):
+        read_points(tmp_path / "a.ply", 3, "srgb")
 
 
 @pytest.mark.parametrize(

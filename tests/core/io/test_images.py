@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+import warnings
 import zlib
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from PIL import Image
 
 from neuprim.core.errors import DataError
 from neuprim.core.io import images
-from neuprim.core.io.exr import COMPRESSIONS, ExrChannel, exr_channels, write_exr, write_exr_layers
+from neuprim.core.io.exr import COMPRESSIONS, REC709, ExrChannel, exr_channels, write_exr, write_exr_layers
 
 
 def noise(*shape: int) -> np.ndarray:
@@ -233,6 +234,18 @@ def test_masks_are_colours_that_are_not_zero(tmp_path: Path) -> None:
     (tmp_path / "m.png").write_bytes(png(2, 2, 16, 0, (b"\0" + bytes(4)) * 2))
     with pytest.raises(DataError, match="16-bit"):
         images.read_mask_image(tmp_path / "m.png")
+
+
+def test_exr_of_other_primaries_is_told(tmp_path: Path) -> None:
+    colors = {c: ExrChannel(torch.ones(2, 2)) for c in "RGB"}
+    acescg = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
+    for primaries in (REC709, acescg):
+        write_exr_layers(tmp_path / "a.exr", colors, {"chromaticities": primaries})
+        with warnings.catch_warnings(record=True) as given:
+            warnings.simplefilter("always")
+            images.read_image(tmp_path / "a.exr")
+        told = ["other chromaticities than Rec. 709; colours are not converted" in str(w.message) for w in given]
+        assert told == ([] if primaries == REC709 else [True])
 
 
 def test_exr_of_one_named_layer(tmp_path: Path) -> None:

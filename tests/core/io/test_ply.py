@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import struct
 import tracemalloc
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.ply import read_ply, read_ply_elements, write_ply
+from neuprim.core.io.ply import PlyVertices, read_ply, read_ply_elements, write_ply
 
 ROWS = np.array(
     [(1.5, -2, 250, 1e-300), (np.float32(0.1), 7, 3, 2.5)],
@@ -23,6 +24,27 @@ def test_every_type_comes_back_to_the_bit(tmp_path: Path) -> None:
     found = read_ply(tmp_path / "a.ply")
     assert found.comments == ("made here", "  two blanks") and found.names == ("x", "count", "red", "mass")
     assert found.rows.tobytes() == ROWS.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "white", "warned"),
+    [
+        ("|u1", [0, 1], 255, False),
+        ("|i1", [0, 100], 127, False),
+        ("<u2", [0, 60000], 65535, False),
+        ("<u2", [0, 200], 255, True),
+        ("<i4", [9, 255], 255, True),
+        ("<f4", [0, 1.5], 1, False),
+        ("<f4", [0, 200], 255, True),
+    ],
+)
+def test_what_counts_as_white(kind: str, values: list[float], white: float, warned: bool, tmp_path: Path) -> None:
+    rows = np.zeros(2, [("red", kind)])
+    rows["red"] = values
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always")
+        assert PlyVertices(rows).white(["red"], tmp_path / "a.ply") == white
+    assert [str(w.message).endswith("read as colours of 0 to 255") for w in given] == [True] * warned
 
 
 def test_other_programs_read_it(tmp_path: Path) -> None:

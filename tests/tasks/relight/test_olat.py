@@ -297,6 +297,17 @@ def test_starting_points_and_orbit(folder: Path, context: SceneContext) -> None:
 # What is refused
 # ----------------------------------------------------------------
 
+
+def test_distances_of_the_camera_are_compared_only_if_both_are_given(
+    folder: Path, context: SceneContext, scenes: Any
+) -> None:
+    for given in ({"camera_far": 2.0}, {"camera_near": 0, "camera_far": 0.5}):
+        edit(folder, lambda d, given=given: d.update(given))  # type: ignore[misc]
+        assert len(read(folder, context).train) == 3
+    edit(folder, lambda d: d.update(camera_near=4.0, camera_far=3.0))
+    scenes.refused(load, {"path": str(folder)}, context, "camera_far is 3.0", "above camera_near, 4")
+
+
 FRAME = "transforms_train.json: frames[1]"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import struct
 import tracemalloc
@@ -150,6 +151,13 @@ def test_nodes_in_circles_and_nested_without_end(tmp_path: Path) -> None:
     assert "20001 nodes; expected at most 20000" in refusal(many)
     (tmp_path / "e.gltf").write_text('{"asset": ' + "[" * 100_000)
     assert "damaged glTF" in refusal(tmp_path / "e.gltf")
+
+
+def test_textures_of_floats_are_refused(tmp_path: Path) -> None:
+    data = io.BytesIO()
+    Image.fromarray(np.full((2, 2), 0.5, np.float32)).save(data, "TIFF")
+    with pytest.raises(DataError, match=r"a\.obj: texture 't\.tif' has float pixels; expected 8 or 16 bits"):
+        materials.decode_texture(tmp_path / "a.obj", "t.tif", data.getvalue())
 
 
 def test_textures_are_bounded_before_they_are_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

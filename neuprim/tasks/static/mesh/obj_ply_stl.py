@@ -333,8 +333,7 @@ def _ply_mesh_colours(element: PlyElement, path: Path) -> NDArray[np.float32] | 
     """Return (N, 3) colours 0..1 of ``element``, the vertices or faces of a .ply file; None if it has no colours."""
     if not set(_RGB) <= set(element.names):
         return None
-    kind = element.rows.dtype["red"]
-    most = np.iinfo(kind).max if kind.kind in "iu" else 1.0
+    most = element.white(_RGB, path)
     if "alpha" in element.names and (element.rows["alpha"] < most).any():
         warn_once(f"{path}: the alpha of colours is ignored; the mesh is drawn opaque")
     return np.clip(np.nan_to_num(element.columns(_RGB) / most), 0, 1).astype(np.float32)

@@ -212,6 +212,8 @@ def decode_texture(path: Path, name: str, data: bytes, left: int = MAX_TEXELS) -
                 if size > min(MAX_PIXELS, left):
                     most = f"{MAX_PIXELS}" if size > MAX_PIXELS else f"{MAX_TEXELS} in all textures together"
                     raise DataError(f"{where} has {image.width}x{image.height} pixels; at most {most} are accepted")
+                if image.mode == "F":
+                    raise DataError(f"{where} has float pixels; expected 8 or 16 bits")
                 if image.mode.startswith("I"):  # 16 bits of grey, which Pillow would cut off at 255
                     grey = (np.asarray(image, np.int64) >> 8).clip(0, 255).astype(np.uint8)
                     return np.array(Image.fromarray(grey).convert("RGBA"))

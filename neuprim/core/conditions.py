@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -192,6 +193,24 @@ def read_conditions(
     return {spec.name: _read_condition(spec, lengths[spec.name] or texts[spec.name], warn) for spec in given}
 
 
+def check_file_condition(
+    spec: ConditionSpec, where: str, numbers: Sequence[float], warn: Warn = _ignore_condition_warning
+) -> list[Tensor]:
+    """Return the numbers of a file as values of a condition, checked as :func:`read_conditions` checks typed numbers.
+
+    Messages begin with ``where``, the file and its key. Raises ConfigError for numbers that the user could not type.
+    """
+    values = [torch.tensor(number) for number in numbers]
+    for value in values:
+        try:
+            spec.parse(_format_condition_number(float(value)))
+        except (NeuprimError, ValueError) as error:
+            _check_condition_range(replace(spec, strict=True), where, [value], warn)
+            raise ConfigError(f"{where}: {error}") from error
+    _check_condition_range(spec, where, values, warn)
+    return values
+
+
 def count_condition_frames(texts: Mapping[str, str], found: Mapping[str, Sequence[Tensor]]) -> int:
     """Return the common number of frames of the conditions ``found``; a condition with one value is constant.
 
@@ -227,7 +246,7 @@ def _read_condition(spec: ConditionSpec, text: str, warn: Warn) -> list[Tensor]:
         if len(values) > _MOST:  # before the next part takes more memory
             shown = f"{condition_flag(spec.name)} {text[:40]}..."
             raise ConfigError(f"{shown}: at least {len(values)} values; expected at most {_MOST}")
-    _check_condition_range(spec, text, values, warn)
+    _check_condition_range(spec, f"{condition_flag(spec.name)} {text}", values, warn)
     return values
 
 
@@ -276,14 +295,13 @@ def _format_condition_number(number: float) -> str:
     return repr(number).removesuffix(".0")
 
 
-def _check_condition_range(spec: ConditionSpec, text: str, values: Sequence[Tensor], warn: Warn) -> None:
-    """Check a condition's values against the condition's range.
+def _check_condition_range(spec: ConditionSpec, shown: str, values: Sequence[Tensor], warn: Warn) -> None:
+    """Check a condition's values against the condition's range; messages begin with ``shown``.
 
     For values outside, call ``warn``, or raise ConfigError if the condition is strict. Values that are not finite
     always raise ConfigError. Bounds are rounded to the dtype of the values, so that float32 0.3 lies within 0 to 0.3.
     """
     low, high = spec.range
-    shown = f"{condition_flag(spec.name)} {text}"
     for value in values:
         if not bool(torch.isfinite(value).all()):
             raise ConfigError(f"{shown}: {_first_where(value, ~torch.isfinite(value)):g}; expected finite numbers")

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuprim.core.conditions import frame_numbers
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.extensions import Inspector
 from neuprim.core.io import images
@@ -140,14 +141,14 @@ def _load_run_inspector(name: str) -> Inspector:
     return replace(inspector, name=name, layers=layers)
 
 
-def _output_paths(out: Path | None, count: int) -> list[Path]:
-    """List the files to write: one numbered picture or OpenVDB file per frame, or a single film or page."""
+def _output_paths(out: Path | None, numbers: Sequence[int]) -> list[Path]:
+    """List the files to write: one picture or OpenVDB file per frame, by its number, or a single film or page."""
     if out is None:
         return []
     suffix = out.suffix.lower()
-    if count == 1 or suffix not in (".png", ".vdb"):
+    if len(numbers) == 1 or suffix not in (".png", ".vdb"):
         return [out]
-    return [out.with_name(f"{out.stem}_{i:04d}{suffix}") for i in range(count)]
+    return [out.with_name(f"{out.stem}_{number:04d}{suffix}") for number in numbers]
 
 
 def _write_run_pictures(out: Path, film: _RunFrames, window: Window) -> list[Path]:
@@ -164,10 +165,9 @@ def _write_run_pictures(out: Path, film: _RunFrames, window: Window) -> list[Pat
 
 def _write_run_frames(out: Path, film: _RunFrames, write: Callable[[Path, InspectionFrame], Any]) -> list[Path]:
     out.parent.mkdir(parents=True, exist_ok=True)
-    paths = _output_paths(out, len(film))
-    for i, path in enumerate(paths):
+    for i, path in enumerate(film.paths):
         write(path, film.frame(i))
-    return paths
+    return film.paths
 
 
 class _RunFrames:
@@ -188,7 +188,8 @@ class _RunFrames:
             events(Note(words))
             pairs = pair_inspected_frames(wanted, self.truth)
         self.pairs = pairs
-        for path in _output_paths(request.out, len(pairs)):
+        self.paths = _output_paths(request.out, frame_numbers(run.header, [conditions for conditions, _ in pairs]))
+        for path in self.paths:
             refuse_existing(path, request.overwrite)
         if request.box is not None:
             box = self.world.scene_box(request.box)

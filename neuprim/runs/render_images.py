@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from neuprim.core.cameras.pinhole import CameraViews
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import read_stored_channels
 from neuprim.core.conditions import (
+    check_file_condition,
     condition_flag,
     count_condition_frames,
     frames_to_times,
@@ -151,11 +153,11 @@ class _RunRenderSession:
         self.background = torch.tensor([float(x) for x in run.header.get("background", [0.0] * channels)])
         self.channels = read_stored_channels(run.directory, run.header, self.task, channels)
         self.lights = () if request.environment is None else self._load_lights(request.environment)
+        self._file: CameraViews | None = None  # None: the cameras are of the run
         self.views, self.fps = self._load_views()
         with run.plugins.attribute_errors():
             numbers, conditions = self._choose_frames()
-            if 1 < len(numbers) < len(self.views):  # one image per frame
-                self.views = [self.views[i * len(self.views) // len(numbers)] for i in range(len(numbers))]
+            self.views = self._views_of_frames(numbers)
             self.views, animated = set_run_view_conditions(self.views, self.task, conditions, notify)
             if numbers:
                 self.views = _name_views_by_frame(self.views, numbers, self._camera_name())
@@ -188,7 +190,8 @@ class _RunRenderSession:
         self.layers = layers if self.format == "exr" else None
         if self.channels.hides_channels and self.format not in ("exr", "npy"):
             notify(f"shown: {self.channels.display_text}; --format exr and npy hold all channels")
-        self._passes, self._visible = 0, False  # images so far, as _count_pass counts them; any shows the model
+        self._passes = 0  # images so far, as _count_pass counts them
+        self._visible: list[bool] = []  # whether the image of each view so far shows the model
 
     def _load_lights(self, environment: EnvironmentFile) -> Sequence[Conditions]:
         """Return each light's conditions. Images under these lights add up to the image under the environment map."""
@@ -227,10 +230,12 @@ class _RunRenderSession:
         """Return the views to render, in the model's coordinates, and the frames per second; None if not stated."""
         request, fps = self.request, self.request.fps
         if request.camera not in SETS:
-            file = read_camera_file(Path(request.camera), request.size)
+            file = self._file = read_camera_file(Path(request.camera), request.size)
             for note in file.notes:
                 self.notify(f"{request.camera}: {note}")
-            views, fps = _run_views_of_camera_file(file, self.task, request.conditions), fps or file.fps
+            typed = request.conditions if request.frame is None else {**request.conditions, "time": request.frame}
+            views = _run_views_of_camera_file(file, self.task, typed, request.camera, self.notify)
+            fps = fps or file.fps
             views = [replace(view, camera=self.world.scene_camera(view.camera)) for view in views]
         else:
             dataset = load_dataset(self.run)
@@ -244,6 +249,26 @@ class _RunRenderSession:
         if self.lights:  # they replace the views' own; where only the presence matters, the first is used
             views = [replace(view, conditions={**view.conditions, **self.lights[0]}) for view in views]
         return views, fps
+
+    def _views_of_frames(self, numbers: Sequence[int]) -> list[View]:
+        """Return the views to render at the frames of ``--frame``: all views if their number fits, or one per frame.
+
+        The time codes of a USD stage are frame numbers. Raises ConfigError if cameras of a file match no frames.
+        """
+        views, file, count = self.views, self._file, len(numbers)
+        if file is None:
+            return [views[i * len(views) // count] for i in range(count)] if 1 < count < len(views) else views
+        at = {math.floor(code + 0.5): view for code, view in zip(file.codes or (), views, strict=False)}
+        if numbers and all(number in at for number in numbers):
+            return [at[number] for number in numbers]
+        if len(views) == 1 or count in (0, len(views)) or (count == 1 and not at):
+            return views
+        known = f" (of frames {min(at)} to {max(at)})" if at else ""
+        raise ConfigError(
+            f"--frame {self.request.frame}: {count} {'frame' if count == 1 else 'frames'}, but {self.request.camera} "
+            f"has {len(views)} cameras{known}; expected {'frames in that range' if at else 'one frame'}, or as many "
+            "frames as cameras"
+        )
 
     def _camera_name(self) -> str:
         return _view_file_names([Path(self.request.camera.partition("#")[0]).resolve().stem])[0]
@@ -273,13 +298,14 @@ class _RunRenderSession:
         name = self._camera_name()
         # "renders" holds the report's pictures
         folder = self.run.directory / "frames" / name if out is None else out
-        if self.animate:
-            return [folder.with_suffix(suffix)]
+        if self.animate:  # only the suffix of an animation is replaced: shot.v001 becomes shot.v001.webp
+            stem = folder.stem if folder.suffix.lower().removeprefix(".") in ANIMATIONS else folder.name
+            return [folder.with_name(stem + suffix)]
         return [folder / f"{name}{suffix}" for name in _view_file_names([view.name for view in self.views])]
 
     def write_animation(self, path: Path) -> None:
         stack = [self.channels.display(self._render_pixels(view)) for view in self.views]
-        self._refuse_empty_images()
+        self._report_empty_images()
         write_animation(path, stack, self.fps or min(30.0, max(len(self.views) / 4.0, 5.0)))
 
     def write_images(self, paths: Sequence[Path]) -> None:
@@ -287,10 +313,11 @@ class _RunRenderSession:
             if self.layers is None:
                 self._write_image(path, self._render_pixels(view))
             else:
+                self._visible.append(False)
                 with self.run.plugins.attribute_errors():
                     self.layers.write(path, self.model, view, self._count_pass)
         try:
-            self._refuse_empty_images()
+            self._report_empty_images()
         except DataError:
             for path in paths:
                 path.unlink()
@@ -307,6 +334,7 @@ class _RunRenderSession:
             write_animation(path, [shown], self.fps or 12.0)
 
     def _render_pixels(self, view: View) -> Tensor:
+        self._visible.append(False)
         if self.shutter is None:
             return self._render_sub_frame(view)
         sub_frames = (self._render_sub_frame(moment) for moment in self.shutter.sub_frames(view))
@@ -327,13 +355,21 @@ class _RunRenderSession:
         There is one image for each view, sub-frame of motion blur and light.
         """
         each, count = max(len(self.lights), 1) * (self.shutter.samples if self.shutter else 1), len(self.views)
-        self._visible |= bool((alpha > 0).any())
+        self._visible[-1] |= bool((alpha > 0).any())
         self._passes += 1
         self.progress(f"view {-(-self._passes // each)} of {count}", self._passes / (each * count))
 
-    def _refuse_empty_images(self) -> None:
-        """Raise DataError if no image shows the model. The error states the model's box and the first camera's pose."""
-        if self._visible:
+    def _report_empty_images(self) -> None:
+        """Name the images that do not show the model; raise DataError if no image shows it.
+
+        The error states the model's box and the first camera's pose.
+        """
+        if any(self._visible):
+            names = _view_file_names([view.name for view in self.views])
+            empty = [name for name, visible in zip(names, self._visible, strict=True) if not visible]
+            if empty:
+                listed = ", ".join(empty[:8]) + (", ..." if len(empty) > 8 else "")
+                self.notify(f"{len(empty)} of {len(names)} images are empty: {listed}")
             return
         view, where = self.views[0], "no primitive is there under these conditions"
         with torch.no_grad():
@@ -352,12 +388,19 @@ class _RunRenderSession:
         )
 
 
-def _run_views_of_camera_file(file: CameraViews, task: TaskSpec, conditions: Mapping[str, str]) -> list[View]:
+def _run_views_of_camera_file(
+    file: CameraViews,
+    task: TaskSpec,
+    conditions: Mapping[str, str],
+    path: str,
+    warn: Callable[[str], None] = lambda text: None,
+) -> list[View]:
     """Return one view per camera in the file, with the file's time if the task has a time and the user gave none."""
-    has_time = any(spec.name == "time" and not spec.shape for spec in task.conditions)
-    timed = file.times is not None and "time" not in conditions and has_time
-    times = [{"time": torch.tensor(time)} for time in file.times or ()] if timed else [{} for _ in file.named]
-    return [View(name, camera, time) for (name, camera), time in zip(file.named, times, strict=True)]
+    spec = next((spec for spec in task.conditions if spec.name == "time" and not spec.shape), None)
+    if spec is None or file.times is None or "time" in conditions:
+        return [View(name, camera, {}) for name, camera in file.named]
+    times = check_file_condition(spec, f"{path}: time", file.times, warn)
+    return [View(name, camera, {"time": time}) for (name, camera), time in zip(file.named, times, strict=True)]
 
 
 def set_run_view_conditions(

@@ -121,6 +121,12 @@ def test_a_volume_file_is_the_density_in_scene_units(run_dir: Path, tmp_path: Pa
     assert float(expected.max()) > 3 and np.allclose(dense, expected, atol=1e-4)
 
 
+def test_files_have_frame_numbers(run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("neuprim.core.conditions.source_frames", lambda header: (1003, 1005))
+    assert main(["inspect", str(run_dir), "--frame", "1004-1005", "--grid", "8", "--out", str(tmp_path / "v.vdb")]) == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["v_1004.vdb", "v_1005.vdb"]
+
+
 def test_the_numbers_are_those_of_the_data_set(run_dir: Path, tmp_path: Path) -> None:
     stored = load_run(run_dir)
     expected = {f["frame"]: f for f in stored.task.diagnose(load_dataset(stored), stored.model)["sigma_frames"]}

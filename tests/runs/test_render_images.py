@@ -3,6 +3,10 @@ drawn, and a header that says what is what."""
 
 from __future__ import annotations
 
+import importlib.util
+import json
+import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -14,6 +18,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from neuprim.__main__ import main
 from neuprim.core.cameras.pinhole import CameraViews
 from neuprim.core.channels import Channels
 from neuprim.core.data import View
@@ -34,6 +39,7 @@ from neuprim.tasks.relight.colour import LightNetwork
 from tests import scenes
 from tests.lit_models import light
 from tests.lit_models import model as lit
+from tests.plugins.marked import write_run
 from tests.pretend_card import CARD, pretended
 from tests.timed_models import model as timed
 
@@ -271,16 +277,111 @@ def test_lengths_that_differ_and_what_is_missing_are_refused() -> None:
 
 def test_a_files_times_are_the_frames_where_the_task_has_a_time() -> None:
     file = CameraViews(tuple((v.name, v.camera) for v in VIEWS), times=(0.0, 0.25, 0.5, 1.0))
-    assert [float(v.conditions["time"]) for v in _run_views_of_camera_file(file, DYNAMIC, {})] == [0.0, 0.25, 0.5, 1.0]
-    assert [v.conditions for v in _run_views_of_camera_file(file, DYNAMIC, {"time": "0.5"})] == [{}] * 4, (
+    assert [float(v.conditions["time"]) for v in _run_views_of_camera_file(file, DYNAMIC, {}, "c.json")] == [
+        0.0,
+        0.25,
+        0.5,
+        1.0,
+    ]
+    assert [v.conditions for v in _run_views_of_camera_file(file, DYNAMIC, {"time": "0.5"}, "")] == [{}] * 4, (
         "what the user says comes first"
     )
-    assert [v.conditions for v in _run_views_of_camera_file(file, RELIGHT, {})] == [{}] * 4
-    assert [v.conditions for v in _run_views_of_camera_file(replace(file, times=None), DYNAMIC, {})] == [{}] * 4
+    assert [v.conditions for v in _run_views_of_camera_file(file, RELIGHT, {}, "")] == [{}] * 4
+    assert [v.conditions for v in _run_views_of_camera_file(replace(file, times=None), DYNAMIC, {}, "")] == [{}] * 4
     views, animated = set_run_view_conditions(
-        _run_views_of_camera_file(file, BOTH, {}), BOTH, {"light": "orbit:4:40:4", "light_intensity": "2"}
+        _run_views_of_camera_file(file, BOTH, {}, ""), BOTH, {"light": "orbit:4:40:4", "light_intensity": "2"}
     )
     assert animated and [float(v.conditions["time"]) for v in views] == [0.0, 0.25, 0.5, 1.0]
+
+    with pytest.raises(ConfigError, match=r"c\.json: time: 3 is outside its range, 0 to 1"):
+        _run_views_of_camera_file(replace(file, times=(0.0, 0.5, 3.0, 1.0)), DYNAMIC, {}, "c.json")
+
+
+@pytest.fixture(scope="module")
+def shot(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the frames 1001 to 1010."""
+    words = ["task=dynamic", "scene=vdb", "scene.vdb=nowhere"]
+    folder = tmp_path_factory.mktemp("shots") / "run"
+    return write_run(folder, volume(), words, color_space="linear", data={"frames": [1001, 1010]})
+
+
+def json_cameras(path: Path, places: Sequence[float]) -> Path:
+    rows = [[[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 2.6], [0, 0, 0, 1]] for x in places]
+    file = {"w": 8, "h": 8, "camera_angle_x": 0.7, "frames": [{"transform_matrix": matrix} for matrix in rows]}
+    path.write_text(json.dumps(file))
+    return path
+
+
+def usd_cameras(path: Path, first: int, last: int) -> Path:
+    """A camera whose x is its time code - 1000, in thousandths."""
+    at = ", ".join(f"{code}: ({(code - 1000) / 1000}, 0, 2.6)" for code in range(first, last + 1))
+    path.write_text(
+        f"#usda 1.0\n(\n startTimeCode = {first}\n endTimeCode = {last}\n)\n"
+        'def Camera "C"\n{\n float focalLength = 20\n double3 xformOp:translate.timeSamples = {' + at + "}\n"
+        ' uniform token[] xformOpOrder = ["xformOp:translate"]\n}\n'
+    )
+    return path
+
+
+def drawn_shot(run: Path, cameras: Path, frame: str, out: Path) -> dict[str, int]:
+    """File name -> x of the camera in thousandths."""
+    words = ["--camera", str(cameras), "--size", "8x8", "--frame", frame, "--format", "exr", "--out", str(out)]
+    assert main(["render", str(run), *words]) == 0
+    headers = {file.name: OpenEXR.File(str(file)).header() for file in out.iterdir()}
+    return {name: round(-1000 * float(h["neuprim:worldToCamera"][3, 0])) for name, h in sorted(headers.items())}
+
+
+@pytest.mark.parametrize(
+    ("codes", "frame", "expected"),
+    [
+        ((1001, 1010), "1004-1006", {1004: 4, 1005: 5, 1006: 6}),
+        ((1001, 1010), "1005", {1005: 5}),
+        ((1003, 1006), "1003-1006", {1003: 3, 1004: 4, 1005: 5, 1006: 6}),
+        ((1, 3), "1004-1006", {1004: -999, 1005: -998, 1006: -997}),  # by order
+    ],
+)
+def test_time_codes_of_usd_are_frame_numbers(
+    shot: Path, tmp_path: Path, codes: tuple[int, int], frame: str, expected: dict[int, int]
+) -> None:
+    pytest.importorskip("pxr", reason="needs usd-core: pip install 'neuprim[usd]'")
+    found = drawn_shot(shot, usd_cameras(tmp_path / "c.usda", *codes), frame, tmp_path / "out")
+    assert found == {f"c.{number}.exr": x for number, x in expected.items()}
+
+
+def test_frames_that_do_not_fit_the_cameras(shot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    three = json_cameras(tmp_path / "c.json", (0.001, 0.002, 0.003))
+    assert list(drawn_shot(shot, three, "1002-1004", tmp_path / "a").values()) == [1, 2, 3]
+    assert list(drawn_shot(shot, three, "1002", tmp_path / "b").values()) == [1, 2, 3], "all cameras at one time"
+    bad = [(three, "1001-1002", "2 frames, but FILE has 3 cameras; expected one frame, or as many frames as cameras")]
+    if importlib.util.find_spec("pxr"):
+        late = usd_cameras(tmp_path / "late.usda", 1003, 1006)
+        known = "FILE has 4 cameras (of frames 1003 to 1006); expected frames in that range, or as many frames"
+        bad += [(late, "1001-1008", f"8 frames, but {known}"), (late, "1001", f"1 frame, but {known}")]
+    for file, frame, message in bad:
+        out = ["--size", "8x8", "--out", str(tmp_path / "out")]
+        assert main(["render", str(shot), "--camera", str(file), "--frame", frame, *out]) == 2
+        assert f"--frame {frame}: {message.replace('FILE', str(file))}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("out", "file"),
+    [(None, "run/frames/c.v001.webp"), ("fire_v1.2", "fire_v1.2.webp"), ("fire.gif", "fire.webp")],
+)
+def test_a_version_is_no_suffix_of_an_animation(shot: Path, tmp_path: Path, out: str | None, file: str) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(shot, run)
+    words = ["--camera", str(json_cameras(tmp_path / "c.v001.json", (0.0, 0.1))), "--time", "0,1", "--format", "webp"]
+    assert main(["render", str(run), *words, *([] if out is None else ["--out", str(tmp_path / out)])]) == 0
+    assert [p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*.webp")] == [file]
+
+
+@pytest.mark.parametrize("kind", ["png", "exr", "gif"])
+def test_some_empty_images_are_named(shot: Path, tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    cameras = json_cameras(tmp_path / "c.json", (0.0, *[99.0] * 9, 0.1))
+    words = ["--camera", str(cameras), "--time", "0.5", "--format", kind, "--out", str(tmp_path / "out")]
+    assert main(["render", str(shot), *words]) == 0
+    names = ", ".join(f"camera_{i:03d}" for i in range(1, 9))
+    assert f"9 of 11 images are empty: {names}, ...\n" in capsys.readouterr().err
 
 
 def test_no_two_views_share_a_file() -> None:

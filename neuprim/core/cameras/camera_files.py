@@ -188,6 +188,7 @@ def _read_camera_matrix(record: JsonReader, key: str) -> Tensor:
 _USD_MAGIC = (b"#usda ", b"PXR-USDC", b"PK\x03\x04")
 _MAX_USD_BYTES = 1 << 30
 _USD_SECONDS = 120.0
+_USD_POLICY = "expandAperture"
 _UNEQUAL_SCALES = 1e-3  # largest relative deviation of a pose's axis scales from their mean
 
 
@@ -206,8 +207,8 @@ def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = 
     ``prim`` is the prim path of the camera, required if the stage has several cameras. The result has the axes and
     units of the stage. ``size`` is (width, height) in pixels; None uses the size in the stage's render settings. The
     image shows the whole aperture ("expandAperture" of UsdRender). Raises DataError for unreadable stages, orthographic
-    cameras, poses with shear or unequal scales, or if no size is known. Raises BackendUnavailable if the package
-    usd-core is missing.
+    cameras, poses with shear or unequal scales, a size in pixels that are not square, or if no size is known. Raises
+    BackendUnavailable if the package usd-core is missing.
     """
     if importlib.util.find_spec("pxr") is None:
         raise BackendUnavailable(f"{path}: USD files need the package usd-core: pip install 'neuprim[usd]'")
@@ -223,10 +224,14 @@ def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = 
         f"{stage.text('up')} is up and a unit is {stage.number('meters', 'metres per unit', 0.0):g} m in "
         "this file; taken as the axes and units of the run's data"
     )
+    if stage.has("aspectRatioConformPolicy") and (policy := stage.text("aspectRatioConformPolicy")) != _USD_POLICY:
+        note = f"{note}; aspectRatioConformPolicy {policy} is read as {_USD_POLICY}"
     fps = stage.number("fps", "time codes per second above 0", 0.0) if len(cameras) > 1 else None
     if fps is not None and not FRAME_RATES[0] <= fps <= FRAME_RATES[1]:  # some tools count in ticks
         note, fps = f"{note}; timeCodesPerSecond {fps:g} is no rate of a film, --fps says another", None
-    return CameraViews(tuple((f"camera_{i:03d}", camera) for i, camera in enumerate(cameras)), None, fps, (note,))
+    codes = tuple(r.number("code", "a time code") for r in records) if len(records) > 1 else None
+    named = tuple((f"camera_{i:03d}", camera) for i, camera in enumerate(cameras))
+    return CameraViews(named, None, fps, (note,), codes)
 
 
 def _read_usd_stage(path: Path, prim: str) -> JsonReader:
@@ -258,6 +263,9 @@ def _usd_image_size(stage: JsonReader, path: Path) -> tuple[int, int]:
     width, height = (int(x) for x in stage.array("resolution", (2,), "width and height").tolist())
     if not (0 < width <= MAX_IMAGE_SIDE and 0 < height <= MAX_IMAGE_SIDE):
         raise DataError(f"{path}: resolution {width}x{height}; expected 1 to {MAX_IMAGE_SIDE} pixels per side")
+    ratio = stage.number_or("pixelAspectRatio", 1.0)
+    if abs(ratio - 1.0) > 1e-6:
+        raise DataError(f"{path}: pixelAspectRatio {ratio:g}; expected 1 (square pixels), or --size WxH")
     return width, height
 
 

@@ -160,6 +160,7 @@ class CameraViews:
     times: tuple[float, ...] | None = None  # time of each camera, in the file's own unit
     fps: float | None = None  # frames per second, if the file names them
     notes: tuple[str, ...] = ()  # lines for the user on conventions, and on what cannot be rendered
+    codes: tuple[float, ...] | None = None  # time code of each camera of a USD stage: its frame number
 
 
 def camera_exr_attributes(camera: Camera, near: float) -> dict[str, Any]:

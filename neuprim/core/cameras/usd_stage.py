@@ -18,8 +18,8 @@ def read_usd_camera(path: str, wanted: str, most: int) -> dict[str, Any]:
     """Read one camera of the USD stage ``path`` as a JSON object, for :mod:`neuprim.core.cameras.camera_files`.
 
     The object has the keys ``path`` (prim path of the camera), ``frames`` (one per time code), ``fps``, ``up`` (axis),
-    ``meters`` (per unit of the stage) and ``resolution``. ``wanted`` is the camera's prim path, "" for the only camera;
-    ``most`` limits the number of frames. Raises SystemExit with an error message.
+    ``meters`` (per unit of the stage), and those of :func:`usd_render_settings`. ``wanted`` is the camera's prim path,
+    "" for the only camera; ``most`` limits the number of frames. Raises SystemExit with an error message.
     """
     from pxr import Tf, Usd, UsdGeom
 
@@ -47,7 +47,7 @@ def read_usd_camera(path: str, wanted: str, most: int) -> dict[str, Any]:
         "fps": stage.GetTimeCodesPerSecond(),
         "up": str(UsdGeom.GetStageUpAxis(stage)),
         "meters": UsdGeom.GetStageMetersPerUnit(stage),
-        "resolution": usd_camera_resolution(stage),
+        **usd_render_settings(stage),
     }
 
 
@@ -77,10 +77,11 @@ def usd_camera_times(stage: Any, camera: Any, most: int, Usd: Any, UsdGeom: Any)
 
 
 def usd_camera_frame(camera: Any, moment: Any) -> dict[str, Any]:
-    """Return projection, (4, 4) camera-to-world pose for column vectors, focal length and aperture at ``moment``."""
+    """Return time code, projection, (4, 4) camera-to-world pose for column vectors, focal length and aperture."""
     found = camera.GetCamera(moment)
     matrix = found.transform
     return {
+        "code": moment.GetValue(),
         "projection": "perspective" if found.projection == found.Perspective else "orthographic",
         "transform_matrix": [[matrix[column][row] for column in range(4)] for row in range(4)],
         "focal": found.focalLength,
@@ -89,13 +90,23 @@ def usd_camera_frame(camera: Any, moment: Any) -> dict[str, Any]:
     }
 
 
-def usd_camera_resolution(stage: Any) -> list[int] | None:
-    """Return the image size [width, height] in pixels from the stage's render settings; None without a size."""
+def usd_render_settings(stage: Any) -> dict[str, Any]:
+    """Return the stage's render settings; empty without settings.
+
+    ``resolution`` is the image size [width, height] in pixels, ``pixelAspectRatio`` the width of a pixel divided by its
+    height, and ``aspectRatioConformPolicy`` says how to fit the aperture into an image of another shape.
+    """
     from pxr import UsdRender
 
     settings = UsdRender.Settings.GetStageRenderSettings(stage)
-    value = settings.GetResolutionAttr().Get() if settings else None
-    return None if value is None else [int(value[0]), int(value[1])]
+    if not settings:
+        return {}
+    size = settings.GetResolutionAttr().Get()
+    return {
+        "resolution": None if size is None else [int(size[0]), int(size[1])],
+        "pixelAspectRatio": settings.GetPixelAspectRatioAttr().Get(),
+        "aspectRatioConformPolicy": str(settings.GetAspectRatioConformPolicyAttr().Get()),
+    }
 
 
 def limit_usd_memory() -> None:

@@ -316,6 +316,7 @@ def _write_animation_file(
 def _write_mp4(path: Path, frames: Sequence[Tensor], fps: float) -> None:
     try:
         import av
+        from av.video.reformatter import Colorspace
     except ImportError as error:
         what = f"MP4 needs the package av ({error}); pip install 'neuprim[video]', or use .webp"
         raise BackendUnavailable(f"{path}: {what}") from error
@@ -325,7 +326,11 @@ def _write_mp4(path: Path, frames: Sequence[Tensor], fps: float) -> None:
         stream = container.add_stream("h264", rate=Fraction(fps).limit_denominator(1001))
         stream.width, stream.height, stream.pix_fmt = len(columns), len(rows), "yuv420p"
         stream.options = {"crf": "18"}
+        # Without these tags (ITU-T H.273), players guess the matrix from the size of the image.
+        tags = stream.codec_context
+        tags.colorspace, tags.color_primaries, tags.color_trc, tags.color_range = 1, 1, 13, 1  # BT.709, sRGB, 16 to 235
         for frame in frames:
-            picture = av.VideoFrame.from_ndarray(to_uint8(frame).numpy()[rows][:, columns], format="rgb24")
+            pixels = av.VideoFrame.from_ndarray(to_uint8(frame).numpy()[rows][:, columns], format="rgb24")
+            picture = pixels.reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709)
             container.mux(stream.encode(picture))
         container.mux(stream.encode())

@@ -85,6 +85,7 @@ def test_a_camera_that_moves_has_a_frame_per_time_code(tmp_path: Path) -> None:
     path = usd(tmp_path / "a.usda", MOVING, "startTimeCode = 1\n    endTimeCode = 3\n    timeCodesPerSecond = 25")
     found = read_camera_file(path, (640, 480))
     assert len(found.named) == 3 and found.fps == 25 and found.notes[0].startswith("Y is up")
+    assert found.codes == (1, 2, 3)
     for i, (_, camera) in enumerate(found.named):
         assert camera.position.tolist() == pytest.approx([i, -4, 0])
         assert camera.fx == pytest.approx((35 + 5 * i) / 36 * 640)
@@ -136,6 +137,24 @@ def test_missing_sizes_endless_ranges_and_files_of_another_kind(tmp_path: Path) 
     for data in (b"PXR-USDC" + bytes(range(256)) * 9, b"#usda 1.0\n("):
         path.write_bytes(data)
         refused(path, "not a readable USD file")
+
+
+def test_render_settings_that_are_not_followed(tmp_path: Path) -> None:
+    settings = """
+    def RenderSettings "S"
+    {{
+        uniform int2 resolution = (64, 48)
+        uniform float pixelAspectRatio = {}
+        uniform token aspectRatioConformPolicy = "{}"
+    }}
+"""
+    head = 'renderSettingsPrimPath = "/World/S"'
+    cropped = read_camera_file(usd(tmp_path / "a.usda", CAMERA + settings.format(1, "cropAperture"), head))
+    assert cropped.notes[0].endswith("; aspectRatioConformPolicy cropAperture is read as expandAperture")
+    path = usd(tmp_path / "b.usda", CAMERA + settings.format(2, "expandAperture"), head)
+    refused(path, r"b\.usda: pixelAspectRatio 2; expected 1 \(square pixels\), or --size WxH", None)
+    found = read_camera_file(path, (640, 480))
+    assert found.named[0][1].width == 640 and "aspectRatioConformPolicy" not in found.notes[0]
 
 
 def test_a_reader_that_never_ends_or_dies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

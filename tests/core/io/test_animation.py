@@ -32,6 +32,21 @@ def test_animations_hold_their_frames_and_spools_write_the_same_bytes(tmp_path: 
         assert count == 1 or (film.info["duration"] == 100 and film.info.get("loop") == 0)
 
 
+def test_mp4_has_the_matrix_that_its_header_states(tmp_path: Path) -> None:
+    av = pytest.importorskip("av", reason="MP4 needs neuprim[video]")
+    color = np.array([0.9, 0.35, 0.1])
+    write_animation(tmp_path / "a.mp4", [torch.from_numpy(color).float().expand(720, 1280, 3)] * 2, 24.0)
+    with av.open(str(tmp_path / "a.mp4")) as film:
+        frame, coded = next(film.decode(video=0)), film.streams.video[0].codec_context
+        tags = (coded.colorspace, coded.color_primaries, coded.color_trc, coded.color_range)
+    assert tags == (1, 1, 13, 1), "BT.709, transfer of sRGB, 16 to 235"
+    luma = float(color @ (0.2126, 0.7152, 0.0722))
+    blue, red = (color[2] - luma) / 1.8556, (color[0] - luma) / 1.5748
+    planes = frame.to_ndarray()
+    found = planes[:720].mean(), planes[720:900].mean(), planes[900:].mean()
+    assert found == pytest.approx((16 + 219 * luma, 128 + 224 * blue, 128 + 224 * red), abs=2)
+
+
 @pytest.mark.parametrize(
     ("name", "sizes", "fps", "words"),
     [

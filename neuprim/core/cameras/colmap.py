@@ -53,15 +53,16 @@ def read_colmap_model(folder: Path) -> Any:
         )
     if kind == ".bin":
         check_binary_colmap_model(folder, _lens_parameter_count)
+    framed = (folder / f"frames{kind}").is_file()
     try:
-        stored = _stored_colmap_images(folder / f"images{kind}")
+        stored = _stored_colmap_images(folder / f"images{kind}") if framed or kind == ".txt" else []
         model = pycolmap.Reconstruction(str(folder))
         for number, _, name in stored:
             if " " in name:  # COLMAP cuts names of text files off at the first blank
                 model.images[number].name = name
         for image in model.images.values():
             _ = image.name  # UnicodeDecodeError where it is no UTF-8
-        if (folder / f"frames{kind}").is_file():
+        if framed:
             _check_colmap_frame_poses(model, stored, folder, kind)
         return model
     except DataError:

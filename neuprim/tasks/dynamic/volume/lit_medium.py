@@ -195,7 +195,7 @@ class _MediumGrid:
         shape = self.bricks.shape
         if _same_voxels(grid.transform, self.transform):
             return grid.to_dense(self.box, limit, 0.0)
-        _, level = _subtract_background(grid)
+        level = _finite_background(grid)
         if grid.bounds is None:
             return np.full((*shape, 3)[: 2 + min(grid.channels, 2)], level, np.float32)
         around = _make_medium_bounds(np.array(grid.bounds[0]) - 1, np.array(grid.bounds[1]) + 1)
@@ -233,9 +233,14 @@ class _MediumGrid:
         return found
 
 
+def _finite_background(grid: VdbGrid) -> np.ndarray:
+    """Return the background of a grid, () or (3,) float32, with 0 for numbers that are not finite."""
+    return np.where(np.isfinite(grid.background), grid.background, np.float32(0.0))
+
+
 def _subtract_background(grid: VdbGrid) -> tuple[VdbGrid, np.ndarray]:
     """Return a grid minus its background, so that it is 0 where nothing is stored, and the background, () or (3,)."""
-    level = np.where(np.isfinite(grid.background), grid.background, np.float32(0.0))
+    level = _finite_background(grid)
     if not level.any():
         return grid, level
     tiles = replace(grid.tiles, values=grid.tiles.values - level)
